@@ -123,7 +123,7 @@ def cupboard(
 
 
 def open_shelf(category: str, synset: str, size: Vec3, boards: int) -> Asset:
-    """Boards between two sides and a back, open in front. Objects on a board are on top of the shelf and inside it."""
+    """Boards between two sides and a back, open in front. Objects on a board are on top of the shelf."""
     x, y, z = size
     t = PANEL_M
     panels = [
@@ -133,17 +133,14 @@ def open_shelf(category: str, synset: str, size: Vec3, boards: int) -> Asset:
     ]
     pitch = (z - t) / (boards - 1)
     inner = (x - t, y - 2 * t)
-    supports, interiors = [], []
+    supports = []
     for number in range(boards):
         level = -z / 2 + t + number * pitch
         panels.append(box((t / 2, 0, level - t / 2), (*inner, t)))
         roofed = number < boards - 1
-        tier = f"tier_{number}" if roofed else ""
         clearance = pitch - t if roofed else 1.0
-        supports.append(SupportSurface(f"board_{number}", (t / 2, 0, level), inner, clearance, tier))
-        if roofed:
-            interiors.append(Interior(tier, (t / 2, 0, level + clearance / 2), (*inner, clearance)))
-    return asset(category, synset, size, panels, supports=supports, interiors=interiors)
+        supports.append(SupportSurface(f"board_{number}", (t / 2, 0, level), inner, clearance, framed=roofed))
+    return asset(category, synset, size, panels, supports=supports)
 
 
 def tub(

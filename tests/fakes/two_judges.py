@@ -127,6 +127,8 @@ RUNNING = "ours cleans with a machine only while it runs; the graph takes any"
 START = "the graph's start differs: unmentioned objects are shut, and positions follow the problem"
 CAUSES = {
     FailureReason.NO_FREE_POSE: GEOMETRY,
+    FailureReason.PLACES_OUT_OF_REACH: GEOMETRY,
+    FailureReason.PLACES_BEHIND_DOOR: GEOMETRY,
     FailureReason.NO_CAVITY: GEOMETRY,
     FailureReason.NO_SURFACE: GEOMETRY,
     FailureReason.OUT_OF_REACH: GEOMETRY,

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.blockers import arm_refusal, path_refusal, placing_refusal, room_refusal
+from embomatrix.sim.blockers import (
+    arm_refusal,
+    no_place_refusal,
+    obstacle_in_words,
+    path_refusal,
+    placing_refusal,
+    room_refusal,
+)
 from embomatrix.sim.household import clean, cut, soak
 from embomatrix.sim.joints.panels import DoorPanels
 from embomatrix.sim.joints.swings import SWING
@@ -104,7 +111,6 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Skill
     refusal = placing_refusal(world, held, target, relation)
     if refusal is not None:
         return refusal
-    fails = FailureReason.NO_FREE_POSE
     tried: tuple[StandPose, ...] = ()
     for stand in itertools.chain((world.robot,), other_stands(world, target)):
         found = world.placer.find(held, target, relation, stand, rng, tried)
@@ -113,10 +119,9 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Skill
             world.navigator.refresh()
             return None
         if isinstance(found, FailureReason) and found is not FailureReason.NO_FREE_POSE:
-            fails = found
-            break
+            return refuse(found, held=held, target=target, relation=preposition(call.relation))
         tried = (*tried, stand)
-    return refuse(fails, held=held, target=target, relation=preposition(call.relation))
+    return no_place_refusal(world, held, target, call.relation, tried)
 
 
 def other_stands(world: LiveWorld, target: str) -> Iterator[StandPose]:
@@ -131,7 +136,7 @@ def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillR
     target = target_of(world, call)
     other = world.swings.open(target)
     if other:
-        return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
+        return refuse(FailureReason.DOOR_BLOCKED, target=target, other=obstacle_in_words(other))
     world.navigator.refresh()
     world.robot = world.navigator.step_aside(target, world.robot)
     return None
@@ -147,7 +152,7 @@ def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Skill
         world.navigator.refresh()
         return None
     panels.restore()
-    return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
+    return refuse(FailureReason.DOOR_BLOCKED, target=target, other=obstacle_in_words(other))
 
 
 def _toggle_on(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.engine import FLOOR, WALL
 from embomatrix.sim.floor.obstacles import WALLS
 from embomatrix.sim.geometry.surfaces import link_frame
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.view import SkillRefusal, refuse
+from embomatrix.skills.syntax import PlaceRelation
+from embomatrix.skills.view import SkillRefusal, preposition, refuse
 from embomatrix.world.geometry import FloatArray, Vec2
-from embomatrix.world.poses import Handling
+from embomatrix.world.poses import Handling, StandPose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -23,7 +25,8 @@ if TYPE_CHECKING:
 SAME_M: Final = 1e-6
 RASTER_M: Final = 0.1
 """Spacing of the standing points that are tried."""
-WALL: Final = "a wall"
+A_WALL: Final = "a wall"
+_IN_WORDS: Final = {WALL: A_WALL, FLOOR: "the floor", "": "something"}
 
 
 def arm_refusal(world: LiveWorld, handling: Handling, target: str) -> SkillRefusal | None:
@@ -43,6 +46,20 @@ def placing_refusal(world: LiveWorld, held: str, target: str, relation: Relation
     if not other or not _are_as_loaded(world, target, other):
         return None
     return refuse(FailureReason.ARM_BLOCKED, target=f"a place for {held}", other=other)
+
+
+def no_place_refusal(
+    world: LiveWorld, held: str, target: str, relation: PlaceRelation, stands: Sequence[StandPose]
+) -> SkillRefusal:
+    """Refusal for an object without a free place at the target, from these standing poses. It names the object in the way."""
+    reason, other = world.placer.hindrance(held, target, Relation(relation.value), stands)
+    words = {"held": held, "target": target, "relation": preposition(relation)}
+    return refuse(reason, other=obstacle_in_words(other), **words)
+
+
+def obstacle_in_words(name: str) -> str:
+    """Return an obstacle for a sentence: an object by its name, ``something`` for none."""
+    return _IN_WORDS.get(name, name)
 
 
 def _are_as_loaded(world: LiveWorld, *names: str) -> bool:
@@ -121,7 +138,7 @@ def _main_blocker(world: LiveWorld, points: FloatArray) -> str:
     counts.pop(WALLS, None)
     # Ties go to the first in scene order: the answer is part of the trace.
     number = max(sorted(counts), key=lambda owner: counts[owner], default=WALLS)
-    return world.scene.objects[number].name if counts.get(number) else WALL
+    return world.scene.objects[number].name if counts.get(number) else A_WALL
 
 
 def _raster(low: Vec2, high: Vec2) -> FloatArray:

@@ -200,7 +200,7 @@ class Simulator:
 
     def _description(self, name: str) -> ObjectDescription:
         world = self.world
-        host = world.relations.host_of(name)
+        host = world.hand.hosts.get(name) or world.relations.host_of(name)
         asset = world.asset(name)
         states: list[str] = []
         if asset.joints:

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.blockers import obstacle_in_words
 from embomatrix.sim.state.supports import Host
 from embomatrix.skills.appliances import coverings, liquids_given, taken_off
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation, SkillCall
 from embomatrix.skills.view import SkillRefusal, preposition, refuse, source_of, target_of
 from embomatrix.world.geometry import Aabb, Pose
-from embomatrix.world.state import State
+from embomatrix.world.state import THERMAL, State
 
 if TYPE_CHECKING:
     from embomatrix.sim.live_world import LiveWorld
@@ -29,8 +30,6 @@ SPREADS: Final = (1.0, 1.25, 1.6, 2.0)
 """Spacing of the pieces in multiples of their extent."""
 MAX_ROLL_M: Final = 0.15
 """A piece that comes to rest further away has rolled off."""
-INHERITED: Final = frozenset({State.HOT, State.COOKED, State.FROZEN})
-"""States that pieces inherit from the whole, besides its substances."""
 
 
 def cut(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
@@ -71,16 +70,21 @@ def _break_up(
     world.engine.park(whole)
     if not (_side_by_side(world, pieces, box, base) or _on_host(world, pieces, host, rng)):
         world.engine.set_pose(whole, base)
+        other = ""
+        if host is not None:
+            _, other = world.placer.hindrance(pieces[0], host.name, host.relation, (world.robot,))
         return refuse(
             FailureReason.NO_FREE_POSE,
             held=f"the pieces of {whole}",
             relation=preposition(PlaceRelation(host.relation.value)) if host is not None else "on top of",
             target=host.name if host is not None else "the floor",
+            other=obstacle_in_words(other),
         )
     world.absent.add(whole)
     world.absent.difference_update(pieces)
     for piece in pieces:
-        world.states[piece] |= world.states[whole] & INHERITED
+        world.states[piece] |= world.states[whole] & THERMAL
+        world.treatments[piece] |= world.treatments[whole]
         world.substances[piece] |= world.substances[whole]
     world.navigator.refresh()
     return None

@@ -1,5 +1,6 @@
 """State of a rollout: the engine's scene, the symbolic states, the robot's base and its hand."""
 
+import itertools
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
@@ -11,23 +12,31 @@ from embomatrix.sim.placing.placement import Placer
 from embomatrix.sim.state.facts import EngineFacts, TrackedSets
 from embomatrix.sim.state.relations import Relations
 from embomatrix.sim.state.sources import Change, ChangeReader, Thermal, Water
+from embomatrix.sim.state.supports import Host
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.view import ObjectReach
 from embomatrix.world.asset import Asset
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
-from embomatrix.world.state import State, SubstanceFact
+from embomatrix.world.state import Relation, State, SubstanceFact
 from embomatrix.world.substances import MEANINGS, facts_of
 from embomatrix.world.task import Task
 
+LASTING = frozenset(Relation) - {Relation.INROOM}
+"""Relations between objects that are carried together."""
 SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
 
 
 class Hand:
     """Hand of the robot: holds one object with its contents. Empty at first."""
 
-    def __init__(self, engine: PhysicsEngine) -> None:
+    def __init__(self, engine: PhysicsEngine, relations: Relations) -> None:
         self._engine = engine
+        self._relations = relations
+        self.hosts: Mapping[str, Host] = {}
+        """Hosts of the contents of the held object."""
+        self.pairs: set[tuple[Relation, str, str]] = set()
+        """Relations between the held object and its contents, which last while they are carried. Changed in place."""
         self.offsets: Mapping[str, Pose] = {}
         """Poses of the held object and its contents in the frame of the held object."""
         self.carried: tuple[str, ...] = ()
@@ -39,8 +48,13 @@ class Hand:
 
     def take(self, group: Sequence[str]) -> None:
         """Take the first object of the group, with the others as its contents."""
-        back = self._engine.pose(group[0]).inverse()
+        back, holds = self._engine.pose(group[0]).inverse(), self._relations.holds
+        hosts = {item: host for item in group[1:] if (host := self._relations.host_of(item)) is not None}
+        pairs = itertools.product(LASTING, itertools.permutations(group, 2))
+        kept = [(relation, a, b) for relation, (a, b) in pairs if holds(relation, a, b)]
         self._hold({item: back @ self._engine.pose(item) for item in group})
+        self.hosts = hosts
+        self.pairs.update(kept)
         for item in group:
             self._engine.park(item)
 
@@ -60,7 +74,8 @@ class Hand:
         return True
 
     def _hold(self, offsets: Mapping[str, Pose]) -> None:
-        self.offsets, self.carried = offsets, tuple(offsets)
+        self.offsets, self.carried, self.hosts = offsets, tuple(offsets), {}
+        self.pairs.clear()
 
 
 class LiveWorld:
@@ -80,28 +95,41 @@ class LiveWorld:
         """Blockers of placing in the scene as loaded, by relation, held object and target."""
         self.states: TrackedSets[State] = TrackedSets()
         self.substances: TrackedSets[SubstanceFact] = TrackedSets()
+        self.treatments: TrackedSets[tuple[State, str]] = TrackedSets()
+        """Thermal states of each object with the sources that brought them about."""
         self._future = frozenset(item.name for item in self.scene.objects if item.absent)
         self.absent: set[str] = set(self._future)
         self._changes_since = ChangeReader(engine)
-        self.thermal = Thermal(engine, self.relations, self.states)
+        self.thermal = Thermal(engine, self.relations, self.states, self.treatments)
         self.water = Water(engine, self.relations, self.states, self.substances)
-        self.facts = EngineFacts(self.relations, self.states, self.substances, self.absent, self._future)
+        self.hand = Hand(engine, self.relations)
+        self.facts = EngineFacts(
+            self.relations,
+            self.states,
+            self.substances,
+            self.absent,
+            self._future,
+            self.hand.pairs,
+            self.treatments,
+        )
         self.table: tuple[str, ...] = ()
         self.rooms = tuple(room.name for room in self.scene.rooms)
         self.robot = self.navigator.start
-        self.hand = Hand(engine)
         for item in self.scene.objects:
             self.states[item.name] = set(item.states & SYMBOLIC)
             self.substances[item.name] = set(facts_of(item.states, item.substances))
+            self.treatments[item.name] = set()
         self.let_sources_act()
         self.states.snapshot()
         self.substances.snapshot()
+        self.treatments.snapshot()
 
     def reset(self, task: Task) -> None:
         """Return to the scene's start, after the sources have acted on the objects at them."""
         self.engine.reset()
         self.states.restore()
         self.substances.restore()
+        self.treatments.restore()
         self.absent.clear()
         self.absent |= self._future
         self.hand.forget()
@@ -187,6 +215,8 @@ class LiveWorld:
         lines = [f"{robot.x_m.hex()} {robot.y_m.hex()} {robot.yaw.hex()}\n{carried}"]
         for name, states in self.states.changed():
             lines.append(f"{name}:{','.join(sorted(states))}")
+        for name, treated in self.treatments.changed():
+            lines.append(f"{name}:{','.join(f'{state} {source}' for state, source in sorted(treated))}")
         for name, facts in self.substances.changed():
             lines.append(f"{name}:{','.join(f'{fact.relation} {fact.substance}' for fact in sorted(facts))}")
         if self.absent:

@@ -46,6 +46,7 @@ WORDS: Final[Mapping[Relation, str]] = {
 class ObjectDescription:
     """Facts about one object for its description: its place, and its ``states`` in words, in order.
 
+    ``held`` is True for the held object and its contents, whose ``host`` is in the hand too.
     ``gone`` is True for an object that is not in the world: a future piece, or an object that was cut up.
     """
 
@@ -80,12 +81,9 @@ def line(item: ObjectDescription) -> str:
     """Describe one object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
     if item.gone:
         return f"{item.name}: not there"
-    if item.held:
-        place = "in the robot's hand"
-    elif item.host and item.relation is not None:
-        place = f"{WORDS[item.relation]} {item.host} in {item.room or 'no room'}"
-    else:
-        place = f"in {item.room or 'no room'}"
+    place = "in the robot's hand" if item.held else f"in {item.room or 'no room'}"
+    if item.host and item.relation is not None:
+        place = f"{WORDS[item.relation]} {item.host} {place}"
     return f"{item.name}: {', '.join([place, *item.states])}"
 
 

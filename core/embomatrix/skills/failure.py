@@ -77,7 +77,15 @@ class FailureReason(StrEnum):
     )
     NO_FREE_POSE = (
         "no_free_pose",
-        "there is no free place for {held} {relation} {target} within reach: make space or choose another object",
+        "there is no free place for {held} {relation} {target}: {other} is in the way; make space or choose another object",
+    )
+    PLACES_OUT_OF_REACH = (
+        "places_out_of_reach",
+        "every place for {held} {relation} {target} is out of the arm's reach: choose another object",
+    )
+    PLACES_BEHIND_DOOR = (
+        "places_behind_door",
+        "the open door of {target} is between the arm and every place for {held}: choose another object",
     )
     PLACE_ON_ITSELF = "place_on_itself", "{held} can't be placed {relation} itself: choose another object"
     NOT_A_HEAT_SOURCE = (

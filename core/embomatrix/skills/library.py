@@ -83,6 +83,12 @@ class SkillDefinition:
     outcomes: tuple[FailureReason, ...] = ()
 
 
+NO_PLACE: Final = (
+    FailureReason.NO_FREE_POSE,
+    FailureReason.PLACES_OUT_OF_REACH,
+    FailureReason.PLACES_BEHIND_DOOR,
+)
+"""Reasons why an object that fits a place, as far as its shape goes, can't be put there now."""
 _AT_HAND: Final = (Precondition.IN_REACH, Precondition.APPROACHABLE, Precondition.ACCESSIBLE)
 _HAND_FREE_FOR: Final = (Precondition.OBJECT_LISTED, Precondition.HAND_FREE)
 _DOOR: Final = (*_HAND_FREE_FOR, Precondition.OPENABLE, *_AT_HAND)
@@ -125,7 +131,7 @@ LIBRARY: Final[Mapping[Skill, SkillDefinition]] = {
             Precondition.HAS_CAVITY,
             Precondition.OPENED_FOR,
         ),
-        (FailureReason.NO_FREE_POSE, FailureReason.NO_SURFACE, FailureReason.NO_CAVITY),
+        (*NO_PLACE, FailureReason.NO_SURFACE, FailureReason.NO_CAVITY),
     ),
     Skill.MOVE_FORWARD: SkillDefinition(
         "the heading grows by the angle, and the robot stands further along it",

@@ -48,7 +48,8 @@ class SupportSurface:
 
     ``center_m`` lies on the surface; ``size_m`` is its extent along the asset's x and y; ``clearance_m`` is the free height
     above it. ``interior`` names the cavity whose floor the surface is; empty in the open. ``link`` names the moving link that
-    carries the surface, such as a drawer; empty for the base.
+    carries the surface, such as a drawer; empty for the base. A ``framed`` surface has walls on three sides, as a board in
+    a bookcase: objects stand on it, not in a cavity.
     """
 
     name: str
@@ -57,6 +58,12 @@ class SupportSurface:
     clearance_m: float
     interior: str = ""
     link: str = ""
+    framed: bool = False
+
+    @property
+    def walled(self) -> bool:
+        """True if an object must fit on the surface with its whole footprint."""
+        return self.framed or bool(self.interior)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +114,11 @@ class Asset:
     def __post_init__(self) -> None:
         joints = tuple((link.name, link.joint) for link in self.links if link.joint is not None)
         object.__setattr__(self, "joints", joints)
+
+    @property
+    def open_supports(self) -> tuple[SupportSurface, ...]:
+        """Surfaces outside cavities: an object there is on top of the asset, not inside it."""
+        return tuple(surface for surface in self.supports if not surface.interior)
 
     def can(self, ability: str) -> bool:
         return ability in self.abilities

@@ -17,7 +17,7 @@ from typing import Final, NoReturn
 
 from embomatrix.world.evaluate import atoms_of, render
 from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified, Quantifier
-from embomatrix.world.state import SubstanceRelation
+from embomatrix.world.state import THERMAL, SubstanceRelation
 from embomatrix.world.substances import is_substance
 
 _UNARY: Final = (
@@ -31,9 +31,13 @@ _BINARY: Final = (
 ARITIES: Final[Mapping[str, tuple[int, ...]]] = {
     **dict.fromkeys(_UNARY, (1,)),
     **dict.fromkeys(_BINARY, (2,)),
+    **dict.fromkeys(THERMAL, (1, 2)),
     "grasped": (1, 2),  # the paper's tasks omit the agent
 }
-"""Predicates of both dialects with the argument counts that each accepts."""
+"""Predicates of both dialects with the argument counts that each accepts.
+
+The second argument of ``cooked``, ``frozen`` and ``hot`` is our own extension: the source that brought the state about.
+"""
 ROOM_TYPES: Final = frozenset(
     (
         "bar", "bathroom", "bedroom", "biology_lab", "break_room", "chemistry_lab", "childs_room",

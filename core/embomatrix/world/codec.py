@@ -68,7 +68,7 @@ def asset_to_json(asset: Asset, tables: TableWriter | None = None) -> Json:
             | ({"joint": _builtins(link.joint)} if link.joint is not None else {})
             for link in asset.links
         ],
-        "supports": [_without_empty_link(surface) for surface in asset.supports],
+        "supports": [_surface_to_json(surface) for surface in asset.supports],
         "interiors": [_without_empty_link(interior) for interior in asset.interiors],
         "abilities": {key: dict(sorted(params.items())) for key, params in sorted(asset.abilities.items())},
     }
@@ -119,6 +119,13 @@ def scene_of(record: SceneJson, tables: Tables | None = None) -> Scene:
 
 def _builtins(value: object) -> Any:
     return msgspec.to_builtins(value, enc_hook=float)  # numpy's scalars
+
+
+def _surface_to_json(surface: SupportSurface) -> Json:
+    found = _without_empty_link(surface)
+    if not surface.framed:
+        del found["framed"]
+    return found
 
 
 def _without_empty_link(value: SupportSurface | Interior) -> Json:

@@ -166,6 +166,7 @@ class SurfaceJson(Record):
     clearance_m: Number
     interior: str
     link: str = ""
+    framed: bool = False
 
 
 class InteriorJson(Record):

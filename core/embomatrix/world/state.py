@@ -29,6 +29,10 @@ class State(StrEnum):
     SOAKED = "soaked"
 
 
+THERMAL = frozenset({State.COOKED, State.FROZEN, State.HOT})
+"""States that heat and cold sources give. A goal may name the source as a second argument: ``hot(apple_1, oven_1)``."""
+
+
 class SubstanceRelation(StrEnum):
     """Symbolic relations of an object to a substance. ``covered(a, dust.n.01)`` means that dust lies on a."""
 

@@ -259,7 +259,7 @@ def a_door():
         (lambda: RequestedAtom(predicate=RequestPredicate.ONTOP, thing=HOST, place=HOST), "can't be carried"),
         (
             lambda: RequestedAtom(predicate=RequestPredicate.ONTOP, thing=THING, place=VIEW.item(THING).host),
-            "is there already|does not go",
+            "is there already|does not go|does not fit",
         ),
         (
             lambda: RequestedAtom(predicate=RequestPredicate.INSIDE, thing=THING, place=THING),

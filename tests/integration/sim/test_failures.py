@@ -44,6 +44,7 @@ REACHED = {
     FailureReason.OUT_OF_REACH: "pick_up mug_1",
     FailureReason.TOO_HIGH: "pick_up apple_4",
     FailureReason.HAND_FULL: "move apple_1; pick_up apple_1; move fridge_1; open fridge_1",
+    FailureReason.PLACES_OUT_OF_REACH: "move apple_1; pick_up apple_1; move tower_1; place tower_1 ontop",
     FailureReason.HAND_EMPTY: "move fridge_1; place fridge_1 ontop",
     FailureReason.NOT_PORTABLE: "move fridge_1; pick_up fridge_1",
     FailureReason.TOO_HEAVY: "move anvil_1; pick_up anvil_1",
@@ -95,6 +96,7 @@ ELSEWHERE = {
     FailureReason.TOO_LARGE,
     FailureReason.DOOR_BLOCKED,
     FailureReason.NO_FREE_POSE,
+    FailureReason.PLACES_BEHIND_DOOR,
 }
 """Reasons that the tests below reach in dedicated scenes."""
 
@@ -253,3 +255,41 @@ def test_full_bowl_accepts_no_further_object(flat):
         "move table_lamp_1; pick_up table_lamp_1; move bowl_1; place bowl_1 inside",
     )
     assert trace.failure is FailureReason.NO_FREE_POSE
+    assert trace.steps[-1].blocker in {"apple_1", "mug_1", "apple_2"}
+    assert f": {trace.steps[-1].blocker} is in the way" in trace.steps[-1].message
+
+
+FILL_THE_FRIDGE = (
+    "move fridge_1; open fridge_1; move apple_1; pick_up apple_1; move fridge_1; place fridge_1 inside"
+)
+
+
+def beside_a_fridge(width_m, *blocks):
+    """Return the flat with a fridge, an apple on a stool, and blocks of furniture: their x, y and extents."""
+    fridge = make.cupboard("fridge", "electric_refrigerator.n.01", (0.7, width_m, 1.6), abilities={})
+    stool, apple = make.block("stool", "stool.n.01", (0.4, 0.4, 0.5), {}), make.apple()
+    objects = [
+        (placed("fridge_1", fridge, "kitchen_0", upright(0.36, 2.0, 0.0, fridge), fixed=True), fridge),
+        (placed("stool_1", stool, "kitchen_0", upright(3.0, 3.4, 0.0, stool), fixed=True), stool),
+        (placed("apple_1", apple, "kitchen_0", upright(3.0, 3.4, 0.5, apple)), apple),
+    ]
+    for number, (x, y, depth, width) in enumerate(blocks):
+        block = make.block(f"block{number}", "block.n.01", (depth, width, 0.9), {})
+        objects.append(
+            (placed(f"block{number}_1", block, "kitchen_0", upright(x, y, 0.0, block), fixed=True), block)
+        )
+    return replace(scene_of("fridge", objects), robot=RobotStart(1.2, 3.2, 0.0, "kitchen_0"))
+
+
+def test_robot_returns_to_an_open_fridge_on_the_side_that_its_door_leaves_free():
+    # The nearest free places from before the door was opened are all behind it now.
+    trace = executed_alone(beside_a_fridge(0.6, (1.4, 1.8, 0.5, 0.6)), FILL_THE_FRIDGE)
+    assert trace.failure is None, trace.steps[-1].message
+
+
+def test_door_that_cuts_off_the_floor_in_front_of_its_fridge_is_named():
+    trace = executed_alone(beside_a_fridge(0.7, (2.0, 1.5, 1.0, 1.6), (1.0, 0.9, 1.9, 0.3)), FILL_THE_FRIDGE)
+    assert trace.failure is FailureReason.PLACES_BEHIND_DOOR
+    assert trace.steps[-1].message == (
+        "the open door of fridge_1 is between the arm and every place for apple_1: choose another object"
+    )

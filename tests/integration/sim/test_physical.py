@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from tests.fakes import furniture as make
 from tests.fakes.plans import executed, with_objects
-from tests.fakes.scenes import kitchen_scene, placed, upright
+from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 from tests.fakes.skill_reasons import MISHAPS, reasons_of
 
 from embomatrix.sim.physical.actor import MOTIONS, PhysicalActor, physical_simulator
@@ -14,6 +14,7 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import RobotStart
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,24 @@ def test_every_skill_has_a_motion_and_listed_mishaps():
 def test_physical_mode_succeeds_where_cached_mode_does(flat, text):
     trace = executed(flat, text)
     assert trace.failure is None, trace.steps[-1].message
+
+
+@pytest.mark.parametrize(("x", "y"), [(1.1, 1.9), (1.2, 2.1), (1.0, 2.2)])
+@pytest.mark.parametrize("simulator_of", [load_simulator, physical_simulator])
+def test_door_that_an_obstacle_stops_is_shut_after_the_failed_attempt(simulator_of, x, y):
+    fridge = make.cupboard("fridge", "electric_refrigerator.n.01", (0.7, 0.7, 1.6), abilities={})
+    crate = make.block("crate", "crate.n.01", (0.3, 0.3, 0.3), {})
+    objects = [
+        (placed("fridge_1", fridge, "kitchen_0", upright(0.36, 2.0, 0.0, fridge), fixed=True), fridge),
+        (placed("crate_1", crate, "kitchen_0", upright(x, y, 0.0, crate), fixed=True), crate),
+    ]
+    scene = replace(scene_of("crate", objects), robot=RobotStart(2.0, 1.2, 0.0, "kitchen_0"))
+    simulator = simulator_of(Bundle(scene, {}))
+    trace = executed(simulator, "move fridge_1; open fridge_1")
+    is_open = simulator.facts.holds("open", ("fridge_1",))
+    simulator.close()
+    assert trace.failure in {FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED}
+    assert not is_open
 
 
 def test_food_is_taken_out_of_the_opened_fridge(flat):

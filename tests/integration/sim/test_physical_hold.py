@@ -127,9 +127,9 @@ def test_object_that_fits_a_board_one_way_is_gripped_at_its_outer_side(play, wid
         (placed("stand_1", stand, "kitchen_0", upright(0.6, 2.85, 0.0, stand, yaw), fixed=True), stand),
         (placed("book_1", book, "kitchen_0", upright(2.4, 1.3, TABLE_TOP_M, book)), book),
     ]
-    trace, simulator = play(extra, "move book_1; pick_up book_1; move rack_1; place rack_1 inside")
+    trace, simulator = play(extra, "move book_1; pick_up book_1; move rack_1; place rack_1 ontop")
     assert trace.failure is None, trace.steps[-1].message
-    assert simulator.world.relations.inside("book_1", "rack_1")
+    assert simulator.world.relations.ontop("book_1", "rack_1")
 
 
 def test_cup_gripped_at_its_wall_stays_where_it_is_put(play):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.fakes.furniture import cupboard
 
 from embomatrix.sim.geometry.batch_poses import PoseBoxes
-from embomatrix.sim.joints.behind_panels import behind_panels
+from embomatrix.sim.geometry.behind_panels import behind_panels
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 

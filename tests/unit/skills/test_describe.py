@@ -18,6 +18,12 @@ def test_description_contains_host_room_and_states():
     assert line(item) == "apple_1: inside bowl_1 in kitchen_0, cooked, hot"
 
 
+def test_contents_of_a_carried_basket_are_described_inside_it():
+    apple = ObjectDescription("apple_1", "kitchen_0", "basket_1", Relation.INSIDE, held=True)
+    assert line(apple) == "apple_1: inside basket_1 in the robot's hand"
+    assert line(ObjectDescription("basket_1", "kitchen_0", held=True)) == "basket_1: in the robot's hand"
+
+
 def test_object_on_the_floor_is_described_with_its_room():
     assert (
         line(ObjectDescription("fridge_1", "kitchen_0", states=("closed",)))

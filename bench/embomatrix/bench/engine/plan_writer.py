@@ -169,7 +169,7 @@ class PlanWriter:
             return PlaceRelation.INSIDE
         if self._rng.random() < UNDER_SHARE:
             return PlaceRelation.UNDER
-        return PlaceRelation.ONTOP if asset.supports else PlaceRelation.INSIDE
+        return PlaceRelation.ONTOP if asset.open_supports else PlaceRelation.INSIDE
 
     def _succeeds(self, calls: Sequence[SkillCall]) -> bool:
         return all(self._simulator.run_step(call).ok for call in calls)

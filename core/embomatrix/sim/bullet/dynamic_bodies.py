@@ -1,7 +1,7 @@
 """Bodies of a stepped scene, addressed by object name: placed, moved, put to sleep and woken."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
@@ -18,6 +18,11 @@ FLOOR_HALF_M: Final = 200.0
 HINGE_NM: Final = 0.4
 RUNNER_N: Final = 2.0
 """Friction of hinged doors and of drawers."""
+CLOSER_NM: Final = 4.0
+CLOSER_N: Final = 20.0
+"""Strength with which a panel swings, or slides, back after a failed attempt to move it."""
+BACK_PER_S: Final = 1.5
+"""Speed of such a panel, in rad/s or m/s."""
 SLOW_M_S: Final = 0.01
 SLOW_RAD_S: Final = 0.1
 MOVED_M: Final = 5e-4
@@ -95,6 +100,32 @@ class DynamicBodies:
     def is_in(self, name: str) -> bool:
         """Return True if the object is in the world, also in the hand."""
         return self.pose(name).position_m[2] > AWAY_M / 2
+
+    def swing_back(self, name: str, fractions: Sequence[float]) -> None:
+        """Pull the panels of an object to shares of their travel while time passes, until ``brake``."""
+        self.wake((name,))
+        asset = self._scene.asset_of(name)
+        for index, (_, joint), fraction in zip(self._joints[name], asset.joints, fractions, strict=True):
+            self._bullet.setJointMotorControl2(
+                self._bodies[name],
+                index,
+                self._bullet.POSITION_CONTROL,
+                targetPosition=fraction * joint.upper,
+                maxVelocity=BACK_PER_S,
+                force=CLOSER_NM if joint.kind is JointKind.REVOLUTE else CLOSER_N,
+            )
+
+    def brake(self, name: str) -> None:
+        """Leave the panels of an object to their friction."""
+        asset = self._scene.asset_of(name)
+        for index, (_, joint) in zip(self._joints[name], asset.joints, strict=True):
+            self._bullet.setJointMotorControl2(
+                self._bodies[name],
+                index,
+                self._bullet.VELOCITY_CONTROL,
+                targetVelocity=0,
+                force=HINGE_NM if joint.kind is JointKind.REVOLUTE else RUNNER_N,
+            )
 
     def put(self, name: str, pose: Pose) -> None:
         """Bring in an object from outside the world, such as the piece of a sliced one."""
@@ -182,6 +213,8 @@ class DynamicBodies:
             body = self._factory.hinged(asset, pose)
             self._joints[name] = self._factory.joint_indices(asset)
             self._swing(body, name, joints)
+            self._bodies[name] = body
+            self.brake(name)
         else:
             (body,) = self._factory.jointed(asset, [pose])
             self._bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw)
@@ -189,16 +222,12 @@ class DynamicBodies:
         self._bodies[name], self._names[body] = body, name
 
     def _swing(self, body: int, name: str, joints: tuple[float, ...]) -> None:
-        """Set limits, friction and positions of the joints."""
+        """Set limits and positions of the joints."""
         asset = self._scene.asset_of(name)
         for index, (_, joint), fraction in zip(self._joints[name], asset.joints, joints, strict=True):
             low, high = min(0.0, joint.upper), max(0.0, joint.upper)
             self._bullet.changeDynamics(body, index, jointLowerLimit=low, jointUpperLimit=high)
             self._bullet.resetJointState(body, index, fraction * joint.upper)
-            force = HINGE_NM if joint.kind is JointKind.REVOLUTE else RUNNER_N
-            self._bullet.setJointMotorControl2(
-                body, index, self._bullet.VELOCITY_CONTROL, targetVelocity=0, force=force
-            )
 
     def _angle(self, name: str, index: int) -> float:
         return float(self._bullet.getJointState(self._bodies[name], index)[0])

@@ -152,7 +152,7 @@ class PlanSampler:
 
     def _may_hold(self, row: int, relation: PlaceRelation) -> bool:
         asset = self._world.asset(self._task.table[row])
-        return bool(asset.interiors if relation is PlaceRelation.INSIDE else asset.supports)
+        return bool(asset.interiors if relation is PlaceRelation.INSIDE else asset.open_supports)
 
     def _free_hand(self) -> bool:
         """Put the held object on any surface."""

@@ -20,6 +20,7 @@ from embomatrix.sim.floor.open_panels import OpenJoints
 from embomatrix.sim.floor.paths import Cell
 from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.floor.standing import StandingArea
+from embomatrix.sim.geometry.behind_panels import reaches_in
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset
@@ -126,7 +127,8 @@ class Navigator:
 
         Each pose is free, connected to ``origin``, faces the object, and is between the shoulder's and the arm's reach from
         its box. No wall nor anything much taller than the object stands between, nor the sides or back of its furniture.
-        Objects with doors or roofed cavities are served from their front.
+        Objects with doors or roofed cavities are served from their front; with a door open, from where the arm reaches in past
+        it, if there is such a place.
         """
         return tuple(self._stands_from(name, origin))
 
@@ -143,8 +145,11 @@ class Navigator:
         if grid is self.ground.shut:
             yield from self._stands_on_shut(name, start)
             return
-        shut = self.stands_past_shut(name, StandPose(*grid.center(start), 0.0))
         label = grid.label(start)
+        if self.ground.numbers[name] in dict(self.ground.open_joints):
+            yield from self._stands[self._key(name), self.ground.open_joints, label]
+            return
+        shut = self.stands_past_shut(name, StandPose(*grid.center(start), 0.0))
         found = False
         for stand in shut:
             if grid.label_at(stand.x_m, stand.y_m) == label:
@@ -180,9 +185,15 @@ class Navigator:
 
     def _find_stands(self, key: tuple[Surroundings, OpenJoints, int]) -> tuple[StandPose, ...]:
         """Standing poses on one component of the current grid, or of the grid with all panels shut."""
-        (_, name, *_), open_joints, label = key
+        (_, name, pose, _), open_joints, label = key
         grid, area = self.ground.grid if open_joints else self.ground.shut, self.standing_area(name)
-        return area.stands(grid.free_centers(*area.window, label))
+        centers = grid.free_centers(*area.window, label)
+        fractions = dict(open_joints).get(self.ground.numbers[name])
+        if fractions is not None:
+            found = area.stands(centers[reaches_in(centers, self._scene.asset_of(name), pose, fractions)])
+            if found:
+                return found
+        return area.stands(centers)
 
     def step_aside(self, name: str, origin: StandPose) -> StandPose:
         """Pose to serve an object near ``origin``: ``origin`` itself unless a panel takes its place or cuts it off.
@@ -290,6 +301,6 @@ def _within_reach(rectangles: FloatArray, box: Aabb) -> FloatArray:
 
 
 def has_front(asset: Asset) -> bool:
-    """Return True if an object is served from its front only: it has doors, or cavities with a roof."""
-    roofed = any(surface.interior and surface.clearance_m < ROOFED_M for surface in asset.supports)
+    """Return True if an object is served from its front only: it has doors, or boards and cavities with a roof."""
+    roofed = any(surface.walled and surface.clearance_m < ROOFED_M for surface in asset.supports)
     return bool(asset.joints) or roofed

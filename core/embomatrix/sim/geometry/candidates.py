@@ -33,16 +33,15 @@ YAWS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 def surfaces_for(asset: Asset, relation: Relation) -> tuple[SupportSurface, ...]:
     """Surfaces for an object with this relation to the asset, in the asset's frame; empty for none.
 
-    On top: supports outside closable cavities, or the top of the box of an asset without supports. Inside: supports within
-    cavities, and the floors of the other cavities. Under: the floor below the asset.
+    On top: supports outside cavities, or the top of the box of an asset without supports. Inside: supports within cavities,
+    and the floors of the other cavities. Under: the floor below the asset.
     """
-    doored = {interior.name for interior in asset.interiors if interior.closed_by}
     x, y, z = asset.size_m
     match relation:
         case Relation.ONTOP:
             if not asset.supports:
                 return (SupportSurface("", (0.0, 0.0, z / 2), (x, y), math.inf),)
-            return tuple(surface for surface in asset.supports if surface.interior not in doored)
+            return asset.open_supports
         case Relation.INSIDE:
             inner = tuple(surface for surface in asset.supports if surface.interior)
             furnished = {surface.interior for surface in inner}
@@ -160,7 +159,9 @@ def stands_in(held: Asset, pose_support_held: Pose, support: Asset, relation: Re
 def _stands(box: Aabb, support: Asset, relation: Relation) -> bool:
     match relation:
         case Relation.ONTOP:
-            return bool(surface_under(box, support, IDENTITY, doored=False))
+            return not interior_around(box, support) and bool(
+                surface_under(box, support, IDENTITY, in_cavities=False)
+            )
         case Relation.INSIDE:
             return interior_around(box, support) is not None
         case Relation.UNDER:
@@ -172,14 +173,14 @@ def _stands(box: Aabb, support: Asset, relation: Relation) -> bool:
 def _room_for(box: Aabb, surface: SupportSurface) -> Vec2 | None:
     """Largest offset of the box's centre from the surface's along x and y; None if the box does not fit.
 
-    In a cavity the whole footprint must fit; in the open a wide object may extend over both edges.
+    Between walls the whole footprint must fit; in the open a wide object may extend over both edges.
     """
     width, depth, height = box.size_m
     if height + EDGE_M > surface.clearance_m:
         return None
     room = []
     for extent, free in zip((width, depth), surface.size_m, strict=True):
-        if (surface.interior and extent > free) or free < SUPPORTED_SHARE * extent:
+        if (surface.walled and extent > free) or free < SUPPORTED_SHARE * extent:
             return None
         room.append(max(0.0, (free - extent) / 2 - EDGE_M))
     return (room[0], room[1])

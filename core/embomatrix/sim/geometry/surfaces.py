@@ -52,26 +52,25 @@ def link_frame(asset: Asset, pose: Pose, fractions: Sequence[float], link: str) 
 
 
 def surface_under(
-    box: Aabb, asset: Asset, pose: Pose, fractions: Sequence[float] = (), *, doored: bool
+    box: Aabb, asset: Asset, pose: Pose, fractions: Sequence[float] = (), *, in_cavities: bool
 ) -> str:
     """Name of the surface of an asset at ``pose`` that a box rests on; "" for none.
 
     The box's underside lies within 1 cm of the surface and its centre above the rectangle, 5 mm outside allowed; a thin object
     beside another is not on it. Surfaces are the asset's supports at the current joint positions and the top of its bounding
-    box; supports in closable cavities count only if ``doored``. Without ``fractions`` the joints are shut.
+    box; supports in cavities count only if ``in_cavities``. Without ``fractions`` the joints are shut.
     """
     if not is_upright(pose):
         return ""
     fractions = fractions or (0.0,) * len(asset.joints)
     bottom, center = box.low_m[2], box.center_m
     frames = {"": pose}
-    shut_off = () if doored else {interior.name for interior in asset.interiors if interior.closed_by}
     for surface in asset.supports:
         frame = frames.get(surface.link)
         if frame is None:
             frame = frames[surface.link] = link_frame(asset, pose, fractions, surface.link)
         cx, cy, cz = surface.center_m
-        if abs(bottom - frame.position_m[2] - cz) > REST_M or surface.interior in shut_off:
+        if abs(bottom - frame.position_m[2] - cz) > REST_M or (surface.interior and not in_cavities):
             continue
         if center[2] - frame.position_m[2] <= cz or not is_upright(frame):
             continue
@@ -122,7 +121,7 @@ def link_under(box_in_asset: Aabb, asset: Asset, relation: Relation) -> str:
         interior = interior_around(box_in_asset, asset)
         return interior.link if interior is not None else ""
     if relation is Relation.ONTOP:
-        surface = surface_under(box_in_asset, asset, IDENTITY, doored=False)
+        surface = surface_under(box_in_asset, asset, IDENTITY, in_cavities=False)
         return next((item.link for item in asset.supports if item.name == surface), "")
     return ""
 

@@ -62,6 +62,15 @@ class Swings:
                 self._predict(item.name)
                 yield
 
+    def obstacle(self, name: str, goal: float) -> str:
+        """Body that stops the panels on their way to a share of their travel, 0 or 1; "" for none. Changes nothing."""
+        before = self._engine.joints(name)
+        panels = DoorPanels(self._engine, self._relations, name)
+        shut = [[min(share, fraction) for fraction in before] for share in (*reversed(SWING), 0.0)]
+        _, other = panels.swing(_course(before) if goal else shut)
+        panels.restore()
+        return other
+
     def _predict(self, name: str) -> None:
         panels = DoorPanels(self._engine, self._relations, name)
         before = self._engine.joints(name)

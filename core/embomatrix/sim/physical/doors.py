@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from embomatrix.sim.actions import other_stands
+from embomatrix.sim.blockers import obstacle_in_words
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.sim.joints.swings import LEAST_OPEN
 from embomatrix.sim.physical import body
@@ -52,6 +53,8 @@ STRETCHES: Final = (1, 2, 4)
 """Numbers of pulls into which a motion is divided. The robot repositions itself between pulls."""
 ELSEWHERE: Final = 1
 """Other standing poses from which the robot tries to move a panel."""
+BACK_STEPS: Final = 360
+"""Steps of 1/240 s in which panels swing back after a failure."""
 FAR_M: Final = 1.7
 """Longest distance that the base may drive to move a panel."""
 
@@ -137,11 +140,11 @@ def panels_of(stage: PhysicalStage, name: str) -> list[DoorPanel]:
 def move_panels(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | None:
     """Open every panel, the low ones first (``goal`` 1), or shut every panel, the high ones first (``goal`` 0).
 
-    Fails, and leaves its changes, if a panel does not get half open, or shut.
+    Fails if a panel does not get half open, or shut. All panels of the object then swing back to where they were.
     """
     if not stage.dynamic.bodies.has_panels(name):
         return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
-    home = stage.commanded
+    home, before = stage.commanded, stage.dynamic.bodies.joints(name)
     refusal = None
     row = panels_in_order(stage, name, goal)
     # Moving one panel may push another that is done: such panels get a second turn.
@@ -157,6 +160,14 @@ def move_panels(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | 
             break
     # The refusal of this drive does not matter: the door's result stands.
     fold(stage, stage.world.navigator.step_aside(name, home), name)
+    if refusal is not None:
+        stage.dynamic.bodies.swing_back(name, before)
+        stage.mover.wait(BACK_STEPS)
+        stage.dynamic.bodies.brake(name)
+        stage.settle()
+        other = stage.world.swings.obstacle(name, goal)
+        if refusal.reason is FailureReason.DOOR_BLOCKED and other:
+            refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=obstacle_in_words(other))
     return refusal
 
 

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from embomatrix.sim.actions import other_stands
+from embomatrix.sim.blockers import no_place_refusal
 from embomatrix.sim.physical.fold import fold
 from embomatrix.sim.physical.grasp import grasp_tool_paths
 from embomatrix.sim.physical.pick import bases_at, entry, take_by
@@ -60,6 +61,9 @@ def place(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> Sk
     relation = Relation(call.relation.value)
     words = {"held": held, "target": target, "relation": preposition(call.relation)}
     found, stand = _places(stage, target, relation, rng)
+    if found is FailureReason.NO_FREE_POSE:
+        stands = (home, *other_stands(world, target))
+        return no_place_refusal(world, held, target, call.relation, stands)
     if isinstance(found, FailureReason):
         return refuse(found, **words)
     if stand is not home:

@@ -1,7 +1,7 @@
 """Placement of a held object: the first verified pose that is still free and in reach."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final, TypeVar
 
 import numpy as np
@@ -101,6 +101,30 @@ class Placer:
         if found:
             return found
         return FailureReason.NO_FREE_POSE if self._fits(held, target, relation) else fails
+
+    def hindrance(
+        self, held: str, target: str, relation: Relation, stands: Sequence[StandPose]
+    ) -> tuple[FailureReason, str]:
+        """Reason why ``find`` found no pose from any of these standing poses, and the object in the way; "" for none.
+
+        The first standing pose from which places are in reach counts.
+        """
+        found = (FailureReason.PLACES_OUT_OF_REACH, "")
+        before = self._engine.pose(held)
+        try:
+            for stand in stands:
+                search = PlacementSearch(
+                    self._engine, self._relations, self.options, held, target, relation, stand
+                )
+                answer = search.hindrance()
+                if answer[0] is FailureReason.NO_FREE_POSE:
+                    return answer
+                if answer[0] is FailureReason.PLACES_BEHIND_DOOR:
+                    found = answer
+        finally:
+            self._engine.set_pose(held, before)
+            self._engine.park(held)
+        return found
 
     def has_verified(self, held: str, target: str, relation: Relation) -> bool:
         """Return True if any pose was verified for this pair and relation."""

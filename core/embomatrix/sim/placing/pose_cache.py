@@ -50,8 +50,9 @@ class Contents:
         """Return the digest of everything in the asset. The asset is kept, because a freed id could be reused."""
         known = self._known.get(id(asset))
         if known is None:
-            # Pose caches draw with seeds from this digest. `Part` is the former name of `ConvexPart`: the digest keeps it.
-            content = repr(asset).replace("ConvexPart(", "Part(")
+            # Pose caches draw with seeds from this digest, so it keeps the former name `Part` of `ConvexPart`, and skips
+            # the default of a later field.
+            content = repr(asset).replace("ConvexPart(", "Part(").replace(", framed=False", "")
             known = (asset, hashlib.sha256(content.encode()).hexdigest())
             self._known[id(asset)] = known
         return known[1]

@@ -1,6 +1,7 @@
 """Search for poses of one held object on, in or under another, in the engine's present state."""
 
 import functools
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -10,11 +11,12 @@ import numpy as np
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M, PhysicsEngine
 from embomatrix.sim.floor.navigation import has_front
 from embomatrix.sim.geometry.batch_poses import BoolArray, Neighbours, PoseBoxes
+from embomatrix.sim.geometry.behind_panels import behind_panels
 from embomatrix.sim.geometry.statics import is_level, rest_pose
 from embomatrix.sim.geometry.surfaces import is_shut, link_frame, links_with_surfaces
-from embomatrix.sim.joints.behind_panels import behind_panels
 from embomatrix.sim.placing.options import CandidatePoses, PlacementOptions
 from embomatrix.sim.state.relations import Relations
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, Aabb, Pose
@@ -27,6 +29,8 @@ NEAR_M: Final = UNDISTURBED_M + TOLERANCE_M
 """Margin for penetration queries at this distance, which subtract the tolerance."""
 LIVE_TRIES: Final = 64
 """Candidates tried beyond the cached ones."""
+EXAMINED: Final = 12
+"""Places of each set that are examined for the object in the way."""
 LIVE_SETTLES: Final = 8
 """Most of these candidates that are simulated."""
 HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
@@ -88,6 +92,28 @@ class PlacementSearch:
                 found = self._settled()
             if found is not None:
                 yield found
+
+    def hindrance(self) -> tuple[FailureReason, str]:
+        """Reason why no pose is accepted, and the object in the way at most of the places; "" if none is to blame."""
+        met = Counter[str]()
+        is_reached, is_served = False, False
+        fresh = self.options.fresh(self.held, self.target, self.relation, (0.5, 0.5), LIVE_TRIES)
+        for options in (*self.options.verified(self.held, self.target, self.relation), fresh):
+            if not len(options):
+                continue
+            boxes = options.places.world_boxes(self.engine.joints(self.held), self._frames)
+            served = np.flatnonzero(self._served(boxes, self.robot)).tolist()
+            is_reached |= bool(boxes.reached_from(self.robot).any())
+            is_served |= bool(served)
+            for number in served[:EXAMINED]:
+                self.engine.set_pose(self.held, options.pose(number, self._frames))
+                met[self.engine.penetrates(self.held)] += 1
+        if not is_served:
+            hidden = is_reached and any(self.engine.joints(self.target))
+            return FailureReason.PLACES_BEHIND_DOOR if hidden else FailureReason.PLACES_OUT_OF_REACH, ""
+        # Ties go to the first by name: the answer is part of the trace.
+        others = sorted(met.keys() - {"", self.target})
+        return FailureReason.NO_FREE_POSE, max(others, key=lambda name: met[name], default="")
 
     def _roomy_first(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, str]]:
         """Candidates in reach: first those with nothing but the target around, then the others; handy ones lead each group.

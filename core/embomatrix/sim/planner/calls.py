@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.check import within_reach
 from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.library import NO_PLACE
 from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Plan, Skill, SkillCall
 from embomatrix.skills.trace import Step
 from embomatrix.world.task import Task
@@ -70,7 +71,7 @@ class PlanCalls:
         if found is not None and found.ok:
             return found
         step = self.use(Skill.PLACE, target, relation)
-        if step.failure is FailureReason.NO_FREE_POSE:
+        if step.failure in NO_PLACE:
             for other in self._neighbours(target):
                 again = self._from_beside(other, call, target)
                 if again is not None and again.ok:

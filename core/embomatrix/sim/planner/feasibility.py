@@ -30,7 +30,7 @@ def why_impossible(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
         return _relation_obstacle(world, task, literal)
     if needs_tools(predicate):
         return _tool_obstacle(world, task, literal)
-    (name,) = literal.atom.args
+    name = literal.atom.args[0]
     match State(predicate):
         case State.OPEN:
             if not world.asset(name).joints:
@@ -99,10 +99,13 @@ def _tool_obstacle(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
 
 
 def _temperature_obstacle(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
-    (name,), state = literal.atom.args, State(literal.atom.predicate)
+    (name, *stated), state = literal.atom.args, State(literal.atom.predicate)
     if state is State.COOKED and not literal.positive:
         return _no_skill(literal)
-    if sources_for(world, task, name, frozenset((state,)), hot=needs_heat(literal)):
+    able = sources_for(world, task, name, frozenset((state,)), hot=needs_heat(literal))
+    if stated and literal.positive:
+        return "" if stated[0] in able else f"{stated[0]} does not make {name} {state.value}"
+    if able:
         return ""
     change = "" if literal.positive else "no longer "
     return f"no object in the table makes {name} {change}{state.value}: expected a heat or cold source"

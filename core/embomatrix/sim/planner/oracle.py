@@ -24,7 +24,7 @@ from embomatrix.skills.syntax import Plan
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Not
 from embomatrix.world.scene import Scene
-from embomatrix.world.state import Relation, State
+from embomatrix.world.state import THERMAL, Relation, State
 from embomatrix.world.task import Task
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def _attempts(options: Sequence[Choice]) -> list[tuple[Choice, Strategy]]:
 
 def _strategies(choice: Choice) -> list[Strategy]:
     predicates = [item.atom.predicate for item in choice]
-    warm = bool({State.HOT, State.COOKED, State.FROZEN} & set(predicates))
+    warm = bool(THERMAL & set(predicates))
     choosy = warm or any(map(needs_tools, predicates))
     carried = sum(predicate in set(Relation) for predicate in predicates)
     found = itertools.product(
@@ -232,18 +232,19 @@ def _exposures(
         if item.positive and item.atom.predicate in (Relation.INSIDE, Relation.ONTOP)
     }
     needs: dict[tuple[str, bool], set[State]] = {}
+    found: dict[Exposure, None] = {}
     for item in missing:
-        if item.atom.predicate in (State.HOT, State.COOKED, State.FROZEN):
-            key = (item.atom.args[0], needs_heat(item))
-            needs.setdefault(key, set()).add(State(item.atom.predicate))
-    return tuple(
-        Exposure(
-            name,
-            _source_for(simulator, task, name, hot, frozenset(states), homes.get(name, ""), strategy),
-            hot,
-        )
-        for (name, hot), states in sorted(needs.items(), key=lambda need: not need[0][1])
-    )
+        if item.atom.predicate in THERMAL:
+            (name, *stated), hot = item.atom.args, needs_heat(item)
+            if stated and item.positive:
+                found[Exposure(name, stated[0], hot)] = None
+            else:
+                needs.setdefault((name, hot), set()).add(State(item.atom.predicate))
+    for (name, hot), states in needs.items():
+        home = homes.get(name, "")
+        source = _source_for(simulator, task, name, hot, frozenset(states), home, strategy)
+        found[Exposure(name, source, hot)] = None
+    return tuple(sorted(found, key=lambda exposure: not exposure.hot))
 
 
 def _source_for(

@@ -167,7 +167,7 @@ class PlanScript:
                     for item in self._task.table
                     if item not in avoid
                     and item not in self._world.carried
-                    and self._world.asset(item).supports
+                    and self._world.asset(item).open_supports
                     and may_lie_on(self._choice, name, item, self._world.room_of(item))
                 ),
                 key=rank,

@@ -194,9 +194,9 @@ def carry_sequences(
 def _carry_sequences(item: PlacementGoal, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[CarrySequence]:
     match item.relation:
         case Relation.ONTOP:
-            yield from _placed(item, world, PlaceRelation.ONTOP, PlaceRelation.INSIDE)
+            yield from _placed(item, world, PlaceRelation.ONTOP)
         case Relation.INSIDE:
-            yield from _placed(item, world, PlaceRelation.INSIDE, PlaceRelation.ONTOP)
+            yield from _placed(item, world, PlaceRelation.INSIDE)
             for other in rows:
                 if other != item.name and world.relations.inside(other, item.target):
                     on_other = PlacementGoal(item.name, Relation.ONTOP, other)

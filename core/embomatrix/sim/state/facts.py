@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
+from embomatrix.world.state import THERMAL, Relation, State, SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import MEANINGS, fact_holds
 
 if TYPE_CHECKING:
@@ -19,8 +19,12 @@ STATES = {state.value: state for state in State}
 SUBSTANCES = {relation.value: relation for relation in SubstanceRelation}
 REAL, FUTURE = "real", "future"
 """Predicates of BDDL: the object is in the world; the object was absent at the start and still is."""
-ARGUMENTS = dict.fromkeys((*RELATIONS, *SUBSTANCES), 2) | dict.fromkeys((*STATES, REAL, FUTURE), 1)
-"""Number of arguments of each predicate."""
+ARGUMENTS = (
+    dict.fromkeys((*RELATIONS, *SUBSTANCES), (2,))
+    | dict.fromkeys((*STATES, REAL, FUTURE), (1,))
+    | dict.fromkeys(THERMAL, (1, 2))
+)
+"""Numbers of arguments that each predicate takes. The second one of a thermal state is its source."""
 
 
 class TrackedSets(dict[str, set[T]]):
@@ -69,8 +73,10 @@ class FactError(ValueError):
 class EngineFacts:
     """Facts of the present moment; they change with the engine and the states.
 
-    ``states`` and ``substances`` map each object to its states and facts; ``absent`` are the objects outside the world. All
-    are read at every query, not copied. ``future`` are the objects that were absent at the start.
+    ``states`` and ``substances`` map each object to its states and facts; ``absent`` are the objects outside the world;
+    ``carried`` are the relations between the held object and its contents; ``treatments`` maps each object to its thermal
+    states with the sources that brought them about. All are read at every query, not copied. ``future`` are the objects that
+    were absent at the start.
     """
 
     relations: Relations
@@ -78,28 +84,33 @@ class EngineFacts:
     substances: Mapping[str, Set[SubstanceFact]]
     absent: Set[str]
     future: Set[str]
+    carried: Set[tuple[Relation, str, str]]
+    treatments: Mapping[str, Set[tuple[State, str]]]
 
     def holds(self, predicate: str, args: tuple[str, ...]) -> bool:
         """Return True if ``predicate(args)`` holds. Raises FactError for unknown predicates, objects or argument counts.
 
         An object outside the world has no state and no substances.
         """
-        if ARGUMENTS.get(predicate) != len(args):
+        if len(args) not in ARGUMENTS.get(predicate, ()):
             raise FactError(
                 f"found ({' '.join((predicate, *args))}): expected one of {', '.join((*RELATIONS, *SUBSTANCES))} with "
-                f"two arguments or one of {', '.join((*STATES, REAL, FUTURE))} with one"
+                f"two arguments or one of {', '.join((*STATES, REAL, FUTURE))} with one; "
+                f"{', '.join(sorted(THERMAL))} may name their source as a second"
             )
         relation = RELATIONS.get(predicate)
-        for item in args[:1] if relation in (None, Relation.INROOM) else args:
+        for item in args[:1] if relation is Relation.INROOM or predicate in SUBSTANCES else args:
             if item not in self.states:
                 raise FactError(f"there is no object {item!r} in the scene: expected one of its objects")
         if relation is not None:
-            return self.relations.holds(relation, *args)
+            return (relation, *args) in self.carried or self.relations.holds(relation, *args)
         name, absent = args[0], args[0] in self.absent
         if predicate in SUBSTANCES:
             return not absent and fact_holds(SUBSTANCES[predicate], args[1], self.substances[name])
         if predicate in STATES:
-            return not absent and self._has_state(name, STATES[predicate])
+            state, sources = STATES[predicate], args[1:]
+            treated = not sources or (state, sources[0]) in self.treatments[name]
+            return not absent and treated and self._has_state(name, state)
         return (absent and name in self.future) if predicate == FUTURE else not absent
 
     def _has_state(self, name: str, state: State) -> bool:

@@ -54,7 +54,7 @@ class Relations:
     def ontop(self, a: str, b: str) -> bool:
         """Return True if ``a`` rests on a surface of ``b``: underside within 1 cm, centre above the rectangle (+ 5 mm).
 
-        Open shelf boards and bottoms of bowls count. Boards behind a door do not: objects there are inside.
+        Shelf boards count. Floors of cavities do not: an object in a bowl or a fridge is inside, and never on top as well.
         """
         return self._apart(a, b) and self.supports.is_on(a, b)
 
@@ -68,8 +68,8 @@ class Relations:
     def under(self, a: str, b: str) -> bool:
         """Return True if parts of ``b`` lie over the centre of ``a`` and all of these begin above its top, 1 cm tolerance.
 
-        Centre and top are those of ``a`` with its joints shut: an open door moves nothing out from under a shelf. The roof of
-        a cavity ends the relation: an object in the oven is not under the worktop.
+        Centre and top are those of ``a`` with its joints shut: an open door moves nothing out from under a shelf. A roof ends
+        the relation: an object in the oven is not under the worktop, one on a shelf not under a vase on the bookcase.
         """
         if not self._apart(a, b):
             return False
@@ -77,9 +77,8 @@ class Relations:
         if not is_under(box, asset, pose):
             return False
         height_m = min(heights_over(box, asset, pose))
-        return not any(
-            self._roof_m(box, item.name) < height_m for item in self.enclosing(a) if item.name != b
-        )
+        around = {item.name for item in self.enclosing(a)} | set(self.hosts_of(a))
+        return not any(self._roof_m(box, name) < height_m for name in around - {b})
 
     def _roof_m(self, box: Aabb, name: str) -> float:
         """Height of the lowest part of an object over a box; infinite for none."""

@@ -74,15 +74,23 @@ class Change:
 
 
 class Thermal:
-    """Heat and cold sources of a scene. Changes ``states``, the symbolic states by object."""
+    """Heat and cold sources of a scene.
+
+    Changes ``states``, the symbolic states by object, and ``treatments``, the thermal states with their sources.
+    """
 
     def __init__(
-        self, engine: PhysicsEngine, relations: Relations, states: MutableMapping[str, set[State]]
+        self,
+        engine: PhysicsEngine,
+        relations: Relations,
+        states: MutableMapping[str, set[State]],
+        treatments: MutableMapping[str, set[tuple[State, str]]],
     ) -> None:
         self._engine = engine
         self._relations = relations
         self._scene = engine.scene
         self._states = states
+        self._treatments = treatments
         self._sources: list[tuple[str, ThermalSource]] = []
         self._acted = False
         for item in self._scene.objects:
@@ -100,8 +108,8 @@ class Thermal:
                 continue
             if first or source.requires_on or changed.affects(name, self._area(name)):
                 for item in self._above(name):
-                    if self._gained(item, source) and self.is_at(item, name, source):
-                        changes += self._expose(item, source)
+                    if self._gained(item, name, source) and self.is_at(item, name, source):
+                        changes += self._expose(item, name, source)
         return changes
 
     def works(self, name: str, source: ThermalSource) -> bool:
@@ -115,8 +123,10 @@ class Thermal:
 
     def is_at(self, item: str, name: str, source: ThermalSource) -> bool:
         """Return True if the source acts on the object: inside it, on it, or in or on a vessel on it."""
+        if self._relations.inside(item, name):
+            return True
         if source.requires_inside:
-            return self._relations.inside(item, name)
+            return False
         if self._relations.ontop(item, name):
             return True
         return any(
@@ -139,25 +149,28 @@ class Thermal:
     def _bears(self, vessel: str, item: str) -> bool:
         return self._relations.inside(item, vessel) or self._relations.ontop(item, vessel)
 
-    def _gained(self, item: str, source: ThermalSource) -> list[State]:
-        """States that the source would add to the object."""
-        states, asset = self._states.get(item, ()), self._scene.asset_of(item)
+    def _gained(self, item: str, name: str, source: ThermalSource) -> list[State]:
+        """States that the object would have from this source, and has not."""
+        treated, asset = self._treatments.get(item, ()), self._scene.asset_of(item)
         effects = {
             State.HOT: heats(source) and asset.can("heatable"),
             State.COOKED: cooks(source, asset),
             State.FROZEN: freezes(source) and asset.can("freezable"),
         }
-        return [state for state, occurs in effects.items() if occurs and state not in states]
+        return [state for state, occurs in effects.items() if occurs and (state, name) not in treated]
 
-    def _expose(self, item: str, source: ThermalSource) -> list[Change]:
-        """Apply the source's temperature to the object."""
-        gained, states = self._gained(item, source), self._states[item]
-        if State.HOT in gained:
-            states.discard(State.FROZEN)
-        if State.FROZEN in gained:
-            states.discard(State.HOT)
-        states.update(gained)
-        return [Change(item, state.value) for state in gained]
+    def _expose(self, item: str, name: str, source: ThermalSource) -> list[Change]:
+        """Apply the source's temperature to the object. Return its new states."""
+        gained, states = self._gained(item, name, source), self._states[item]
+        for ends, begins in ((State.FROZEN, State.HOT), (State.HOT, State.FROZEN)):
+            if begins in gained and ends in states:
+                states.discard(ends)
+                ended = {treatment for treatment in self._treatments[item] if treatment[0] is ends}
+                self._treatments[item] -= ended
+        new = [state for state in gained if state not in states]
+        states.update(new)
+        self._treatments[item].update((state, name) for state in gained)
+        return [Change(item, state.value) for state in new]
 
 
 class Water:

@@ -157,8 +157,8 @@ class SupportTracker:
                 continue
             pose, fractions = engine.pose(other), engine.joints(other)
             interior = self._interior(name, asset, pose, fractions) if asset.interiors else None
-            surface = surface_under(box, asset, pose, fractions, doored=True) if over else ""
-            if surface and _is_open(box, asset, pose, fractions):
+            surface = surface_under(box, asset, pose, fractions, in_cavities=True) if over else ""
+            if surface and interior is None and _is_outside(box, asset, pose, fractions):
                 on.append(other)
             if interior is None and not surface:
                 continue
@@ -176,7 +176,7 @@ class SupportTracker:
         )
 
     def is_on(self, name: str, other: str) -> bool:
-        """Return True if the object rests on a surface of another one outside closable cavities."""
+        """Return True if the object rests on a surface of another one outside its cavities."""
         known = self._cache_of(name).get(name)
         return other in known.on if known is not None else self.would_be_on(name, other)
 
@@ -194,7 +194,9 @@ class SupportTracker:
         if not box.overlaps(there, REST_M) or not _is_over(box, there):
             return False
         asset, pose, fractions = self._scene.asset_of(other), engine.pose(other), engine.joints(other)
-        return bool(surface_under(box, asset, pose, fractions, doored=False))
+        return bool(surface_under(box, asset, pose, fractions, in_cavities=False)) and not self.would_be_in(
+            name, other
+        )
 
     def would_be_in(self, name: str, other: str) -> bool:
         """Evaluate ``is_in`` without the cache."""
@@ -255,11 +257,9 @@ def _may_be_in(center: Vec3, interiors: Sequence[Interior], slack: float) -> boo
     return False
 
 
-def _is_open(box: Aabb, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> bool:
-    """Return True if a box rests on a surface outside closable cavities."""
-    if not any(interior.closed_by for interior in asset.interiors):
-        return True
-    return bool(surface_under(box, asset, pose, fractions, doored=False))
+def _is_outside(box: Aabb, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> bool:
+    """Return True if a box that rests on a surface does so outside cavities."""
+    return not asset.interiors or bool(surface_under(box, asset, pose, fractions, in_cavities=False))
 
 
 def _first_two(item: tuple[float, str, object]) -> tuple[float, str]:

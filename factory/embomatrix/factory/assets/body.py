@@ -39,6 +39,13 @@ class Body:
         self.supports.append(_surface(name, low, high, z, clearance_m))
         return self
 
+    def add_board(self, name: str, compartment: Aabb) -> Self:
+        """Add the floor of a compartment as a surface between walls; return the body."""
+        (x0, y0, z0), (x1, y1, z1) = compartment.low_m, compartment.high_m
+        low, high = (x0 + FIT_M, y0 + FIT_M), (x1 - FIT_M, y1 - FIT_M)
+        self.supports.append(replace(_surface(f"{name}_floor", low, high, z0, z1 - z0), framed=True))
+        return self
+
     def add_interior(
         self,
         name: str,

@@ -55,6 +55,8 @@ class CabinetStyle:
     bay_m: float = 1.1
     single_door_m: float = 0.62
     drawer_share: float = 0.0
+    boards: bool = False
+    """Compartments are boards to stand objects on, as in a bookcase, and no cavities."""
 
 
 CUPBOARD: Final = CabinetStyle(FrontKind.SIDE_HINGED, wall_m=0.018, tier_m=0.34, plinth_m=0.06)
@@ -75,7 +77,9 @@ FREEZER: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.045, tier_m=0.4, plinth_m
 """No door: BEHAVIOR-1K does not list these categories as openable, yet its tasks keep objects inside them."""
 OVEN: Final = CabinetStyle(FrontKind.DROP_DOWN, wall_m=0.03, tier_m=0.3, plinth_m=0.05, head_m=0.07)
 DISHWASHER: Final = CabinetStyle(FrontKind.DROP_DOWN, wall_m=0.03, tier_m=0.28, plinth_m=0.08, head_m=0.05)
-SHELVING: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.02, tier_m=0.32, plinth_m=0.05, bay_m=1.3)
+SHELVING: Final = CabinetStyle(
+    FrontKind.OPEN, wall_m=0.02, tier_m=0.32, plinth_m=0.05, bay_m=1.3, boards=True
+)
 CUBBY: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.018, tier_m=0.35, plinth_m=0.06, bay_m=1.3)
 DRAWER_CUBBY: Final = replace(CUBBY, drawer_share=0.34)
 WARDROBE: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.022, tier_m=1.1, plinth_m=0.06, bay_m=1.3)
@@ -126,7 +130,7 @@ def _fill(body: Body, style: CabinetStyle, bay: Aabb, front: Aabb, boards: int, 
         front = spanning(front, 2, (front.low_m[2], z))
         boards -= 1
     doors = _doors(body, style, front, prefix)
-    _add_tiers(body, bay, style.tier_m, boards, prefix, doors)
+    _add_tiers(body, bay, style, boards, prefix, doors)
 
 
 def shelving(size_m: Vec3) -> Body:
@@ -185,17 +189,21 @@ def _doors(body: Body, style: CabinetStyle, front: Aabb, prefix: str) -> tuple[s
 
 
 def _add_tiers(
-    body: Body, bay: Aabb, tier_m: float, boards: int, prefix: str, doors: tuple[str, ...]
+    body: Body, bay: Aabb, style: CabinetStyle, boards: int, prefix: str, doors: tuple[str, ...]
 ) -> None:
     """Divide a bay into compartments of equal height, with at most ``boards`` shelf boards."""
     (x0, y0, z0), (x1, y1, z1) = bay.low_m, bay.high_m
-    count = int(clamp(round((z1 - z0) / tier_m), 1, boards + 1))
+    count = int(clamp(round((z1 - z0) / style.tier_m), 1, boards + 1))
     board = clamp(0.02 * (z1 - z0), 0.006, 0.016)
     height = (z1 - z0 - (count - 1) * board) / count
     for tier in range(count):
         floor = z0 + tier * (height + board)
         name = f"{prefix}shelf{tier + 1}" if count > 1 else f"{prefix}inside"
-        body.add_interior(name, spanning(bay, 2, (floor, floor + height)), doors)
+        tier_bay = spanning(bay, 2, (floor, floor + height))
+        if style.boards:
+            body.add_board(name, tier_bay)
+        else:
+            body.add_interior(name, tier_bay, doors)
         if tier:
             body.parts.append(box((x0, y0, floor - board), (x1 - FIT_M, y1, floor)))
 

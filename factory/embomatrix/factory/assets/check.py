@@ -53,6 +53,7 @@ EXCUSED_FROM_PROBE: Final[Mapping[Family, str]] = {
     Family.SLAB: "a closed carton or package: it is filled with substances",
     Family.SOFT: "a closed bag: it is filled with substances",
     Family.PLATE: "flat: objects lie on it, and it is filled with substances",
+    Family.SHELVING: "open: objects stand on its boards",
 }
 """Families that have no cavity although their categories are fillable, with the reason."""
 

@@ -246,7 +246,7 @@ def _furthest_out(links: tuple[Link, ...]) -> float:
 def top_of(piece: FurniturePiece) -> float:
     """Return the height of the piece's largest open surface above its underside; its full height if it has none."""
     half = piece.asset.size_m[2] / 2
-    tops = [(s.size_m[0] * s.size_m[1], s.center_m[2] + half) for s in piece.asset.supports if not s.interior]
+    tops = [(s.size_m[0] * s.size_m[1], s.center_m[2] + half) for s in piece.asset.supports if not s.walled]
     return max(tops)[1] if tops else piece.asset.size_m[2]
 
 

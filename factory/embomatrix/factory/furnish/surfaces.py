@@ -39,11 +39,15 @@ _SAME_KIND: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Axis-aligned support surface in the world. ``host`` is the index of its piece; ``shut`` means behind a door."""
+    """Axis-aligned support surface in the world.
+
+    ``host`` is the index of its piece. ``walled`` means in a compartment, ``shut`` behind a door.
+    """
 
     host: int
     name: str
     interior: str
+    walled: bool
     x0: float
     y0: float
     x1: float
@@ -63,8 +67,8 @@ def surfaces_of(placed: Placed, number: int) -> list[Surface]:
         cx, cy, cz = placed.pose.apply(support.center_m)
         sx, sy = support.size_m[::-1] if turned else support.size_m
         edges = (cx - sx / 2, cy - sy / 2, cx + sx / 2, cy + sy / 2)
-        inner = support.interior
-        found.append(Surface(number, support.name, inner, *edges, cz, support.clearance_m, inner in doored))
+        inner, walled, shut = support.interior, support.walled, support.interior in doored
+        found.append(Surface(number, support.name, inner, walled, *edges, cz, support.clearance_m, shut))
     return found
 
 
@@ -99,7 +103,7 @@ class SurfacePlacer:
         return [
             s
             for s in surfaces_of(placed, number)
-            if 0.05 < s.z < _HIGHEST_M and not (tall and s.z > _TALL_M and not s.interior)
+            if 0.05 < s.z < _HIGHEST_M and not (tall and s.z > _TALL_M and not s.walled)
         ]
 
     def _ranked(self, piece: FurniturePiece, room: str) -> list[Surface]:
@@ -114,7 +118,7 @@ class SurfacePlacer:
                 continue
             rank = wanted.get(category)
             if rank is None:
-                if category in NO_HOSTS or surface.interior:
+                if category in NO_HOSTS or surface.walled:
                     continue
                 rank = len(wanted) + 3
             together = (piece.category, surface.host, surface.name) in self._holds

@@ -72,8 +72,8 @@ def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
         found.append(
             Plane(f"{host}:{surface.name}", host, item.room, pose, surface.size_m, surface.clearance_m)
         )
-    if not found and asset.supports:
-        # Every asset has at least one surface: the top of its box, such as the lid of a chest.
+    if not found and asset.supports and all(interior.closed_by for interior in asset.interiors):
+        # The top of a closed box, such as the lid of a chest, is a surface too; the rim of a bowl is none.
         x, y, z = asset.size_m
         pose = item.pose_world_asset @ Pose((0.0, 0.0, z / 2))
         found.append(Plane(f"{host}:top", host, item.room, pose, (x, y), math.inf))

@@ -160,7 +160,7 @@ def _rests(scene: Scene, item: SceneObject, box: Aabb) -> bool:
     """True if the underside lies on a surface of the host, with the box's centre above it."""
     host = scene.by_name[item.host]
     for support in scene.assets[host.asset_id].supports:
-        if bool(support.interior) < (item.relation is Relation.INSIDE):
+        if bool(support.interior) is not (item.relation is Relation.INSIDE):
             continue
         x, y, z = host.pose_world_asset.inverse().apply((*box.center_m[:2], box.low_m[2]))
         cx, cy, cz = support.center_m

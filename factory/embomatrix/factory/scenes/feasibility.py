@@ -70,10 +70,10 @@ class SimulatedRobot(CapableRobot):
         return self._achieves(atom if on else Not(atom), Subgoals(on={name: on}), name)
 
     def can_treat(self, object_name: str, source: str, state: State) -> bool:
-        """True if the object can become hot, cooked or frozen at the source and is not so yet."""
+        """True if the object can become hot, cooked or frozen at the source and is not so yet by that source."""
         exposure = Exposure(object_name, source, hot=state is not State.FROZEN)
         return self._achieves(
-            Atom(state.value, (object_name,)), Subgoals(exposures=(exposure,)), object_name, source
+            Atom(state.value, (object_name, source)), Subgoals(exposures=(exposure,)), object_name, source
         )
 
     def _achieves(self, goal: Formula, subgoals: Subgoals, *names: str) -> bool:

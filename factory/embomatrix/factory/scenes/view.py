@@ -121,13 +121,11 @@ class SceneView:
     def is_surface(self, name: str) -> bool:
         """True for furniture with an open surface at working height."""
         item, asset = self.item(name), self.asset(name)
-        shut_off = {interior.name for interior in asset.interiors if interior.closed_by}
         base = item.pose_world_asset.position_m[2]
         return item.fixed and any(
             min(surface.size_m) >= MIN_SURFACE_M
-            and surface.interior not in shut_off
             and LOW_SURFACE_M <= base + surface.center_m[2] <= HIGH_SURFACE_M
-            for surface in asset.supports
+            for surface in asset.open_supports
         )
 
     def is_container(self, name: str) -> bool:
@@ -157,7 +155,7 @@ class SceneView:
                 for interior in asset.interiors
             )
         return any(
-            min(surface.size_m) > size[0] and max(surface.size_m) > size[1] for surface in asset.supports
+            min(surface.size_m) > size[0] and max(surface.size_m) > size[1] for surface in asset.open_supports
         )
 
     def is_openable(self, name: str) -> bool:

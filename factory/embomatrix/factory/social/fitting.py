@@ -8,6 +8,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.occasions import Theme, occasion_of
 from embomatrix.factory.social.values import Cast, DaySlot
 from embomatrix.factory.writer.goals import GoalConjunct
+from embomatrix.world.state import Relation
 
 _GROUP_OF: Final[Mapping[str, ItemKind]] = {
     category: group for group, members in MEMBERS.items() for category in members
@@ -200,7 +201,7 @@ def _is_served_well(conjunct: GoalConjunct, view: SceneView, *, warmed: bool) ->
     for sign in conjunct.signs:
         relation, _, names = sign.rstrip(")").partition("(")
         food, _, host = names.partition(",")
-        if not host:
+        if relation not in (Relation.INSIDE, Relation.ONTOP):
             continue
         inside = relation == "inside"
         if inside and host not in (OVENS if warmed else COLD):

@@ -9,7 +9,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.values import StrictModel
 from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.world.goal import Atom, Formula, Not
-from embomatrix.world.state import Relation
+from embomatrix.world.state import Relation, State
 
 
 class RequestPredicate(StrEnum):
@@ -29,7 +29,10 @@ THERMAL: Final = frozenset({RequestPredicate.COOKED, RequestPredicate.HOT, Reque
 
 
 class RequestedAtom(StrictModel):
-    """Requested atom. ``place`` is the host of a relation. ``holds`` is false for closed or switched off."""
+    """Requested atom. ``place`` is the host of a relation, or the source of a thermal state if the instruction names one.
+
+    ``holds`` is false for closed or switched off.
+    """
 
     predicate: RequestPredicate
     thing: str
@@ -60,14 +63,10 @@ def _problem(requested: RequestedAtom, view: SceneView, known: frozenset[str]) -
             return f"there is no {name!r}: use a name from the list, such as {min(known)!r}"
     if requested.predicate in PLACED:
         return _placing_problem(requested, view)
+    if requested.predicate in THERMAL:
+        return _thermal_problem(requested, view)
     if requested.place:
         return f"it takes no place, found {requested.place!r}"
-    if requested.predicate in THERMAL:
-        if not requested.holds:
-            return "cooked, hot and frozen can only be requested, not the contrary"
-        if not view.asset(requested.thing).can("cookable"):
-            return f"{requested.thing} can't be cooked, heated or frozen"
-        return "" if view.robot.can_pick_up(requested.thing) else _out_of_reach(requested.thing)
     if requested.predicate is RequestPredicate.OPEN:
         if not view.is_openable(requested.thing):
             return f"{requested.thing} has no door or drawer"
@@ -104,6 +103,20 @@ def _placing_problem(requested: RequestedAtom, view: SceneView) -> str:
     if not view.robot.can_place(requested.thing, Relation(requested.predicate.value), requested.place):
         return f"the robot tried and can't place {requested.thing} there: request another object or place"
     return ""
+
+
+def _thermal_problem(requested: RequestedAtom, view: SceneView) -> str:
+    thing, source = requested.thing, requested.place
+    if not requested.holds:
+        return "cooked, hot and frozen can only be requested, not the contrary"
+    if not view.asset(thing).can("cookable"):
+        return f"{thing} can't be cooked, heated or frozen"
+    state = State(requested.predicate.value)
+    if source and not (view.is_source(source) and state in view.thermal_effects(thing, source)):
+        return f"{source} does not make {thing} {state.value}: name another place, or none"
+    if source and not view.robot.can_treat(thing, source, state):
+        return f"the robot tried and can't use {source} for {thing}: request another place, or none"
+    return "" if view.robot.can_pick_up(thing) else _out_of_reach(thing)
 
 
 def _out_of_reach(name: str) -> str:

@@ -1,20 +1,25 @@
-"""Translation of other datasets' problems to the catalog's types, with implied rooms made explicit.
+"""Translation of other datasets' problems to the catalog's types and relations, with implied rooms made explicit.
 
 Renamed types are replaced. A type for a whole group (a table, a book) is replaced by the first member with models
-that the problem does not name yet. The domains of the quantifiers stay the same.
+that the problem does not name yet. The domains of the quantifiers stay the same. Objects are *on* shelves and *in* bowls,
+whichever of both relations the problem names.
 """
 
 import dataclasses
 import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final
 
+from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.task_import.expressible import FLOORS
 from embomatrix.factory.task_import.sources import EAI, SourceText
+from embomatrix.sim.geometry.candidates import surfaces_for
+from embomatrix.world.asset import Asset
 from embomatrix.world.bddl import BddlProblem, InitLiteral, is_room_instance, parse_problem
-from embomatrix.world.evaluate import map_atoms
-from embomatrix.world.goal import Atom
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.evaluate import map_atoms, subformulas
+from embomatrix.world.goal import Atom, Quantified
 from embomatrix.world.state import Relation
 
 RENAMED: Final[Mapping[str, tuple[str, ...]]] = {
@@ -135,11 +140,15 @@ _SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IG
 
 @functools.lru_cache(maxsize=16)
 def read_problem(source: SourceText) -> tuple[BddlProblem, tuple[str, ...]]:
-    """Parse a source, translate its types and add implied rooms. Return the problem and notes. Raise BddlError."""
+    """Parse a source, translate its types and relations, and add implied rooms. Return the problem and notes.
+
+    Raise BddlError.
+    """
     words = GROUPS if source.source == EAI else RENAMED
     text, replaced = translate_types(source.text, {**words, **_lamps_for(source.text)})
-    problem, added = with_implied_rooms(parse_problem(text))
-    return problem, (*replaced, *added)
+    problem, read = with_possible_relations(parse_problem(text))
+    problem, added = with_implied_rooms(problem)
+    return problem, (*replaced, *read, *added)
 
 
 def _lamps_for(text: str) -> dict[str, tuple[str, ...]]:
@@ -159,6 +168,58 @@ def translate_types(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[st
             chosen[name] = free[0]
     notes = tuple(f"{name} is read as {other}" for name, other in chosen.items())
     return _TYPE.sub(lambda match: chosen.get(match[1].lower(), match[1]), text), notes
+
+
+_OTHER: Final = {Relation.ONTOP.value: Relation.INSIDE, Relation.INSIDE.value: Relation.ONTOP}
+
+
+def with_possible_relations(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:
+    """Replace ``ontop`` by ``inside`` for types that have cavities only, and ``inside`` by ``ontop`` for shelves.
+
+    Return a sentence for each replaced pair of relation and type.
+    """
+    bound = {
+        variable: type_name
+        for part in subformulas(problem.goal)
+        if isinstance(part, Quantified)
+        for variable, type_name in part.binders
+    }
+    notes: dict[str, None] = {}
+
+    def read(atom: Atom) -> Atom:
+        other = _OTHER.get(atom.predicate)
+        host = atom.args[-1]
+        type_name = bound.get(host) or problem.objects.get(host, "")
+        if other is None or _takes(type_name, Relation(atom.predicate)) or not _takes(type_name, other):
+            return atom
+        if other is Relation.ONTOP and not _has_boards(type_name):
+            return atom
+        notes[f"{atom.predicate} {type_name} is read as {other.value}"] = None
+        return Atom(other.value, atom.args)
+
+    init = tuple(InitLiteral(read(item.atom), item.positive) for item in problem.init)
+    goal = map_atoms(problem.goal, read)
+    return dataclasses.replace(problem, init=init, goal=goal), tuple(notes)
+
+
+@functools.cache
+def _takes(type_name: str, relation: Relation) -> bool:
+    """True if any model of the type has a surface for objects with this relation to it."""
+    return any(surfaces_for(asset, relation) for asset in _assets_of(type_name))
+
+
+@functools.cache
+def _has_boards(type_name: str) -> bool:
+    """True if any model of the type has shelf boards."""
+    return any(surface.framed for asset in _assets_of(type_name) for surface in asset.supports)
+
+
+def _assets_of(type_name: str) -> Iterator[Asset]:
+    """Yield all models of a type; none of an unknown one."""
+    catalog = Catalog.load()
+    for category in catalog.categories_of(type_name) if catalog.has_synset(type_name) else ():
+        for model in catalog.models_of(category):
+            yield build_asset(catalog, model.category, model.model_id)
 
 
 def with_implied_rooms(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:

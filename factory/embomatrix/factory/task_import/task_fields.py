@@ -12,11 +12,11 @@ from embomatrix.skills.appliances import liquids_given
 from embomatrix.world.bddl import ROOM_TYPES, BddlProblem, is_room_instance
 from embomatrix.world.evaluate import atoms_of
 from embomatrix.world.goal import Formula
-from embomatrix.world.state import Relation, State, SubstanceRelation
+from embomatrix.world.state import THERMAL, Relation, State, SubstanceRelation
 from embomatrix.world.substances import MEANINGS, WATER
 from embomatrix.world.task import TaskCategory
 
-KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
+KITCHEN: Final = THERMAL | {State.SLICED, REAL}
 SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
 CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
 _ROOM_OR_TEXT: Final = re.compile(
@@ -60,9 +60,6 @@ def signature_of(goal: Formula, view: SceneView) -> str:
     return " ".join(sorted(signs))
 
 
-_THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
-
-
 def sources_for(
     view: SceneView, goal: Formula, types: Mapping[str, tuple[str, ...]], known: Iterable[str]
 ) -> Iterator[str]:
@@ -71,7 +68,7 @@ def sources_for(
     The paper's tasks freeze food in coolers, which only keep drinks cool.
     """
     for atom in atoms_of(goal):
-        if atom.predicate not in _THERMAL:
+        if atom.predicate not in THERMAL:
             continue
         effect = State(atom.predicate)
         object_names = types.get(atom.args[0].lstrip("?"), (atom.args[0],))

@@ -62,11 +62,9 @@ class GoalContext:
     room_called: Callable[[SceneView, str], str] = room_words
     voice: Voice | None = None
 
-    def phrase(self, kind: str, *, thing: str, place: str = "", manner: str = "") -> str:
-        """Return one imperative clause. Without a place, only phrases without one are used."""
-        phrases = self.phrases.get(f"{kind} {manner}", self.phrases[kind])
-        options = [text for text in phrases if place or "{place}" not in text]
-        return self._voice.choose(options).format(thing=thing, place=place)
+    def phrase(self, kind: str, manner: str = "") -> str:
+        """Return one imperative clause, with the placeholders ``{thing}`` and, in some clauses, ``{place}``."""
+        return self._voice.choose(self.phrases.get(f"{kind} {manner}", self.phrases[kind]))
 
     def refer(self, name: str, *, taken: bool = False) -> str:
         """Return a noun phrase for an object, or for any object of its category in its room.
@@ -152,7 +150,7 @@ def _place_goal(context: GoalContext, thing: str, called: str) -> GoalConjunct |
     goal, types, objects, place = _any_alike(context, target, lambda host: Atom(predicate, (thing, host)))
     return GoalConjunct(
         goal=goal,
-        clause=context.phrase(predicate, thing=called, place=place),
+        clause=context.phrase(predicate).format(thing=called, place=place),
         objects=(thing, *objects),
         signs=(f"{predicate}({view.category(thing)},{view.category(target)})",),
         kind="place",
@@ -211,7 +209,7 @@ def switch_goal(context: GoalContext) -> GoalConjunct | None:
     manner = _manner(view, name, predicate)
     return GoalConjunct(
         goal=goal,
-        clause=context.phrase(kind, thing=words, manner=manner),
+        clause=context.phrase(kind, manner).format(thing=words),
         objects=objects,
         signs=(f"{kind}({view.category(name)})",),
         kind="switch",
@@ -252,19 +250,21 @@ def thermal_goal(context: GoalContext) -> GoalConjunct | None:
 
 
 def _thermal(context: GoalContext, food: str, source: str, predicate: str) -> GoalConjunct:
+    """Return the goal of the state. It names the source as its second argument if the request names it."""
     view, rng = context.view, context.rng
-    place = context.refer(source)
-    goal: Formula = Atom(predicate, (food,))
-    objects: tuple[str, ...] = (food,)
-    signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)
+    sources, types, objects, place = _any_alike(context, source, lambda name: Atom(predicate, (food, name)))
     called = context.refer(food, taken=True)
-    clause = context.phrase(predicate, thing=called, place=place)
-    if view.is_container(source) and len(view.alike(source)) == 1 and rng.random() < 0.35:
+    phrase = context.phrase(predicate)
+    is_named = "{place}" in phrase
+    clause = phrase.format(thing=called, place=place)
+    goal: Formula = sources if is_named else Atom(predicate, (food,))
+    kinds = [view.category(food), *([view.category(source)] if is_named else [])]
+    signs: tuple[str, ...] = (f"{predicate}({','.join(kinds)})",)
+    if view.is_container(source) and len(objects) == 1 and rng.random() < 0.35:
         goal = And((goal, Atom("inside", (food, source))))
-        objects = (food, source)
         signs = (*signs, f"inside({view.category(food)},{view.category(source)})")
         clause += f" and leave it in the {context.noun(source)}"
-    return GoalConjunct(goal, clause, (*objects, *(view.alike(source))), signs, "thermal", called)
+    return GoalConjunct(goal, clause, (food, *objects), signs, "thermal", called, types if is_named else {})
 
 
 def serving_goal(context: GoalContext) -> GoalConjunct | None:
@@ -274,7 +274,11 @@ def serving_goal(context: GoalContext) -> GoalConjunct | None:
         return None
     food = first.objects[0]
     second = _place_goal(context, food, "it")
-    if second is None or set(second.objects[1:]) & set(first.objects[1:]):
+    if (
+        second is None
+        or set(second.objects[1:]) & set(first.objects[1:])
+        or first.types.keys() & second.types
+    ):
         return None
     return GoalConjunct(
         goal=And((first.goal, second.goal)),
@@ -283,5 +287,5 @@ def serving_goal(context: GoalContext) -> GoalConjunct | None:
         signs=(*first.signs, *second.signs),
         kind=first.kind,
         thing=first.thing,
-        types=second.types,
+        types={**first.types, **second.types},
     )

@@ -136,10 +136,10 @@ class _Script:
                 yield from _at(item, Skill.OPEN)
             case State.TOGGLED_ON, [item] if "off" in item.states:
                 yield from _at(item, Skill.TOGGLE_ON)
-            case State.HOT | State.COOKED, [item]:
-                yield from self._process(item, HEATERS, switch=True)
-            case State.FROZEN, [item]:
-                yield from self._process(item, COOLERS, switch=False)
+            case State.HOT | State.COOKED, [item, *stated]:
+                yield from self._heat(item, stated or self._rows_of(HEATERS))
+            case State.FROZEN, [item, *stated]:
+                yield from self._freeze(item, stated or self._rows_of(COOLERS))
 
     def _negate(self, predicate: str, args: tuple[str, ...]) -> Iterator[SkillCall]:
         row = self._rows.get(args[0])
@@ -166,17 +166,25 @@ class _Script:
             yield from _open(host)
         yield from _at(item, Skill.PICK_UP)
 
-    def _process(self, item: PromptRow, kinds: Sequence[str], *, switch: bool) -> Iterator[SkillCall]:
-        """Put the object into the first machine of these kinds, close it, and switch it on if necessary."""
-        found = [row for kind in kinds for row in self._rows.values() if kind in row.category]
-        if not found:
-            return
-        machine = found[0]
-        yield from self.carry(item, machine, PlaceRelation.INSIDE)
-        if _DOORS & set(machine.states):
-            yield SkillCall(Skill.CLOSE, machine.index)
-        if switch and "off" in machine.states:
-            yield SkillCall(Skill.TOGGLE_ON, machine.index)
+    def _rows_of(self, kinds: Sequence[str]) -> list[PromptRow]:
+        return [row for kind in kinds for row in self._rows.values() if kind in row.category]
+
+    def _heat(self, item: PromptRow, machines: Sequence[PromptRow]) -> Iterator[SkillCall]:
+        """Put the object into the first machine, or onto it if it has no door, close it, and switch it on."""
+        for machine in machines[:1]:
+            has_door = bool(_DOORS & set(machine.states))
+            yield from self.carry(item, machine, PlaceRelation.INSIDE if has_door else PlaceRelation.ONTOP)
+            if has_door:
+                yield SkillCall(Skill.CLOSE, machine.index)
+            if "off" in machine.states:
+                yield SkillCall(Skill.TOGGLE_ON, machine.index)
+
+    def _freeze(self, item: PromptRow, machines: Sequence[PromptRow]) -> Iterator[SkillCall]:
+        """Put the object into the first machine and close it."""
+        for machine in machines[:1]:
+            yield from self.carry(item, machine, PlaceRelation.INSIDE)
+            if _DOORS & set(machine.states):
+                yield SkillCall(Skill.CLOSE, machine.index)
 
 
 def _at(row: PromptRow, skill: Skill) -> Iterator[SkillCall]:

@@ -98,6 +98,8 @@ STEP_CAUSES: Final[Mapping[FailureReason, Cause]] = {
     FailureReason.ARM_BLOCKED: Cause.UNREACHABLE,
     FailureReason.DOOR_BLOCKED: Cause.UNREACHABLE,
     FailureReason.NO_FREE_POSE: Cause.NO_ROOM,
+    FailureReason.PLACES_OUT_OF_REACH: Cause.UNREACHABLE,
+    FailureReason.PLACES_BEHIND_DOOR: Cause.UNREACHABLE,
     FailureReason.ALREADY_OPEN: Cause.ADDITIONAL_STEP,
     FailureReason.ALREADY_CLOSED: Cause.ADDITIONAL_STEP,
     FailureReason.ALREADY_ON: Cause.ADDITIONAL_STEP,

@@ -38,6 +38,27 @@ def behind_panels(
     return behind
 
 
+def reaches_in(centers: FloatArray, asset: Asset, pose: Pose, fractions: Sequence[float]) -> BoolArray:
+    """Return for each point of the floor, shape (n, 2), True if the arm reaches from there into a cavity with an open door.
+
+    True everywhere for an object without an open door.
+    """
+    doors = list(_open_doors(asset, pose, fractions))
+    middles = [pose.apply(interior.center_m) for interior in asset.interiors if not interior.link]
+    if not doors or not middles:
+        return np.ones(len(centers), dtype=np.bool_)
+    walls = bounds_of(asset).base_boxes(IDENTITY)
+    reached = np.zeros(len(centers), dtype=np.bool_)
+    for x, y, z in middles:
+        middle = StandPose(x, y, 0.0)
+        points = np.column_stack([centers, np.full(len(centers), z)])  # (n, 3)
+        barred = _blocked(points, middle, pose, walls, 0.0)
+        for frame, box in doors:
+            barred |= _blocked(points, middle, frame, [box], ARM_M)
+        reached |= ~barred
+    return reached
+
+
 def _open_doors(asset: Asset, pose: Pose, fractions: Sequence[float]) -> Iterator[tuple[Pose, Aabb]]:
     """Frames of the open doors, each with the door's box in its frame."""
     boxes = iter(bounds_of(asset).panel_boxes(IDENTITY, (0.0,) * len(fractions)))
@@ -54,9 +75,9 @@ def _open_doors(asset: Asset, pose: Pose, fractions: Sequence[float]) -> Iterato
 def _blocked(
     middles: FloatArray, stand: StandPose, frame: Pose, boxes: Sequence[Aabb], margin_m: float
 ) -> BoolArray:
-    """Return for each world point, shape (n, 3), True if any of k boxes separates it from the standing pose in the plan.
+    """Return for each world point, shape (n, 3), True if any of k boxes separates it from ``stand`` in the plan.
 
-    The boxes are given in ``frame`` and grown by the margin in the plane.
+    The boxes are given in ``frame`` and grown by the margin in the plane. Boxes above or below a point do not separate it.
     """
     back = frame.inverse()
     turn, offset = back.rotation, np.array(back.position_m)
