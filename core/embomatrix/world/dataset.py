@@ -11,11 +11,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
+
+from msgspec import Meta
 
 from embomatrix.world.bundle import Bundle, decode_bundle
 from embomatrix.world.codec_task import task_of, task_to_json
 from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError
+from embomatrix.world.intent import IntentClause
 from embomatrix.world.records import Record, SceneInvalidError, TaskJson, convert
 from embomatrix.world.task import Task
 from embomatrix.world.whole_file import read_whole, write_whole
@@ -32,7 +35,10 @@ class DatasetError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class TaskRecord:
-    """Admitted task. ``oracle`` is a plan that reaches the goal, as JSON; ``signature`` names the kind of goal."""
+    """Admitted task. ``oracle`` is a plan that reaches the goal, as JSON; ``signature`` names the kind of goal.
+
+    ``intent`` is what the instruction demands; empty if its writer did not say.
+    """
 
     task: Task
     bundle_digest: str
@@ -40,6 +46,7 @@ class TaskRecord:
     oracle: tuple[Mapping[str, object], ...]
     rooms: tuple[str, ...]
     signature: str
+    intent: tuple[IntentClause, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -148,7 +155,8 @@ def write_dataset(folder: Path | str, records: Sequence[TaskRecord], bundles: Ma
 
 
 def record_to_json(record: TaskRecord) -> dict[str, Any]:
-    return {
+    """Record as JSON values. An empty intent is left out."""
+    value: dict[str, Any] = {
         "task": task_to_json(record.task),
         "bundle": record.bundle_digest,
         "split": record.split,
@@ -156,6 +164,21 @@ def record_to_json(record: TaskRecord) -> dict[str, Any]:
         "rooms": [*record.rooms],
         "signature": record.signature,
     }
+    if record.intent:
+        value["intent"] = [
+            {"predicate": clause.predicate, "things": [*clause.things]}
+            | ({"places": [*clause.places]} if clause.places else {})
+            | ({} if clause.holds else {"holds": False})
+            for clause in record.intent
+        ]
+    return value
+
+
+class IntentJson(Record):
+    predicate: str
+    things: Annotated[tuple[str, ...], Meta(min_length=1)]
+    places: tuple[str, ...] = ()
+    holds: bool = True
 
 
 class TaskRecordJson(Record):
@@ -165,6 +188,7 @@ class TaskRecordJson(Record):
     oracle: tuple[dict[str, Any], ...]
     rooms: tuple[str, ...]
     signature: str
+    intent: tuple[IntentJson, ...] = ()
 
 
 def record_from_json(value: object) -> TaskRecord:
@@ -181,6 +205,10 @@ def record_from_json(value: object) -> TaskRecord:
         oracle=record.oracle,
         rooms=record.rooms,
         signature=record.signature,
+        intent=tuple(
+            IntentClause(clause.predicate, clause.things, clause.places, clause.holds)
+            for clause in record.intent
+        ),
     )
 
 

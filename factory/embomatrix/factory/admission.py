@@ -21,10 +21,11 @@ from embomatrix.world.task import Task
 
 
 class RefusalReason(StrEnum):
-    """Reasons in the order of the checks: two for drafts, ten for bindings, the rest for admission."""
+    """Reasons in the order of the checks: three for drafts, ten for bindings, the rest for admission."""
 
     NO_ANSWER = "no_answer"
     UNUSABLE_ANSWER = "unusable_answer"
+    UNFAITHFUL = "unfaithful"
     UNKNOWN_TYPE = "unknown_type"
     SUBSTANCE = "substance"
     INEXPRESSIBLE = "inexpressible"
@@ -41,6 +42,7 @@ class RefusalReason(StrEnum):
     NO_PLAN = "no_plan"
     ORACLE_FAILED = "oracle_failed"
     PHYSICS_FAILED = "physics_failed"
+    SHORTCUT = "shortcut"
 
 
 @dataclass(frozen=True, slots=True)

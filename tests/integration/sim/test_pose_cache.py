@@ -107,9 +107,9 @@ def test_equal_seeds_give_equal_caches(cache, pool) -> None:
 def test_library_identifies_assets_by_content() -> None:
     library = PlacementLibrary()
     first = library.poses(make.apple(), make.kitchen_table(), Relation.ONTOP, 0)
-    started = time.perf_counter()
+    started = time.process_time()
     assert library.poses(make.apple(), make.kitchen_table(), Relation.ONTOP, 0) is first
-    assert time.perf_counter() - started < 0.1
+    assert time.process_time() - started < 0.1
     low = dataclasses.replace(make.kitchen_table(), mass_kg=21.0)
     assert library.poses(make.apple(), low, Relation.ONTOP, 0) != first
     library.close()

@@ -21,7 +21,7 @@ from embomatrix.factory.assets.body import (
 from embomatrix.factory.assets.drawers import add_drawers
 from embomatrix.factory.assets.furniture import slab
 from embomatrix.factory.assets.shapes import box, box_of
-from embomatrix.world.geometry import Aabb, Vec2, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Vec2, Vec3
 
 MAX_PARTS: Final = 16
 """Upper limit for the parts of a link: Bullet silently drops further ones."""
@@ -225,10 +225,23 @@ SHALLOW_M: Final = 0.025
 
 
 def open_box(size_m: Vec3) -> Body:
-    """A box without a lid: baskets, crates, bins, tubs, trays."""
-    wall = clamp(0.04 * min(size_m[:2]), 0.003, 0.05)
-    floor = clamp(0.06 * size_m[2], 0.002, 0.04)
-    parts, cavity = shell(centred(size_m), Walls(wall, wall, wall, wall, floor, 0.0))
+    """A box without a lid: baskets, crates, bins, tubs."""
+    parts, cavity = _open_shell(size_m)
     if cavity.size_m[2] >= SHALLOW_M:
         return Body(parts).add_interior("inside", cavity, clearance_m=OPEN_ABOVE_M)
     return Body(parts).add_support("floor", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])
+
+
+def tray(size_m: Vec3) -> Body:
+    """A board with a rim: objects stand on it, however high the rim is."""
+    parts, cavity = _open_shell(size_m)
+    return Body(parts).add_board(
+        "tray", spanning(cavity, 2, (cavity.low_m[2], cavity.low_m[2] + OPEN_ABOVE_M))
+    )
+
+
+def _open_shell(size_m: Vec3) -> tuple[list[ConvexPart], Aabb]:
+    """Return floor and walls of a box without a lid, and its cavity."""
+    wall = clamp(0.04 * min(size_m[:2]), 0.003, 0.05)
+    floor = clamp(0.06 * size_m[2], 0.002, 0.04)
+    return shell(centred(size_m), Walls(wall, wall, wall, wall, floor, 0.0))

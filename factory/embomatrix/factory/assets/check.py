@@ -54,6 +54,7 @@ EXCUSED_FROM_PROBE: Final[Mapping[Family, str]] = {
     Family.SOFT: "a closed bag: it is filled with substances",
     Family.PLATE: "flat: objects lie on it, and it is filled with substances",
     Family.SHELVING: "open: objects stand on its boards",
+    Family.TRAY: "flat: objects stand on it",
 }
 """Families that have no cavity although their categories are fillable, with the reason."""
 

@@ -56,6 +56,7 @@ class Family(StrEnum):
     WARDROBE = "wardrobe", _cabinet(cabinets.WARDROBE)
     CHEST = "chest", cabinets.chest
     OPEN_BOX = "open_box", cabinets.open_box
+    TRAY = "tray", cabinets.tray
     TABLE = "table", furniture.table
     DRAWER_TABLE = "drawer_table", furniture.drawer_table
     DESK = "desk", furniture.desk

@@ -61,12 +61,13 @@ _NAMES: Final[Mapping[Family, str]] = {
     Family.CUBBY: "nightstand stand wood_fireplace dessert_stand chicken_coop",
     Family.WARDROBE: "wardrobe lab_exhaust_hood",
     Family.CHEST: "carton cedar_chest cooler toolbox violin_case recycling_bin backpack tank tackle_box",
-    Family.OPEN_BOX: "desk_organizer packing_box storage_box toy_box crib hamper trash_can public_trash_can tray baking_sheet "
+    Family.OPEN_BOX: "desk_organizer packing_box storage_box toy_box crib hamper trash_can public_trash_can "
     "ice_tray litter_box compost_bin shopping_basket shopping_cart tote paper_bag lunch_box "
     "pencil_case pizza_box suitcase kayak skiff wheelbarrow dish_rack tupperware birdcage stroller "
     "shoulder_bag briefcase outline_tray drying_rack roasting_pan ice_bucket mop_bucket burlap_bag "
     "cash_register sandbox soap_dish dustpan waffle_maker toaster french_fry_holder knife_block "
     "umbrella_rack first_aid_kit deep_fryer shoe_box pet_bed shower terrarium christmas_stocking",
+    Family.TRAY: "tray baking_sheet",
     Family.TABLE: "breakfast_table coffee_table conference_table console_table garden_coffee_table pool_table booth "
     "gaming_table ironing_board massage_bed trampoline",
     Family.DESK: "desk lab_table",

@@ -13,6 +13,7 @@ from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.build import make_dataset
 from embomatrix.factory.commands.corpus import corpus
 from embomatrix.factory.commands.evaluate import evaluate
+from embomatrix.factory.commands.faithfulness import audit
 from embomatrix.factory.commands.inspection import inspect, pictures
 from embomatrix.factory.commands.language_model import (
     MODEL_ERRORS,
@@ -44,7 +45,7 @@ from embomatrix.world.whole_file import write_whole
 app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
-for command in (agent, lay, inspect, pictures, corpus, verify, evaluate):
+for command in (agent, lay, inspect, pictures, corpus, verify, audit, evaluate):
     app.command()(command)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]

@@ -30,6 +30,8 @@ class BuildSettings:
     """Analyse the arm's reach in each variant: about 12 s of CPU per variant."""
     physical: bool = True
     """Require that a robot carries each plan out in stepped physics: about 1 s of CPU per task."""
+    shortcut_plans: int = 16
+    """Plans tried against each task's instruction before it is admitted: about 5 ms of CPU per plan."""
     modelled: tuple[str, ...] = ()
     """Names of the agents, besides the writer's, that are a language model."""
 

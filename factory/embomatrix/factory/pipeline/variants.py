@@ -10,7 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import TaskRefusal, admit
+from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
+from embomatrix.factory.faithfulness.instruction import audit
+from embomatrix.factory.faithfulness.shortcuts import find_shortcuts, shortcut_in_words
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult, VariantYield
@@ -230,12 +232,27 @@ class _VariantWork:
         return in_split and key not in self._known
 
     def _judge(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> bool:
-        verdict = admit(simulator, draft.task, find_plan, physics=physics)
+        verdict = self._verdict(simulator, physics, draft)
         if isinstance(verdict, TaskRefusal):
             self._reject(draft.task.category, verdict, draft.task.instruction, draft.task.goal_bddl)
             return False
         self._admitted.append((draft, verdict))
         return True
+
+    def _verdict(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> Plan | TaskRefusal:
+        """Return the plan of an admitted draft. Its words and its goal demand the same, and no plan tried shows otherwise."""
+        task = draft.task
+        findings = audit(task, draft.intent, SceneView(self._variant.scene))
+        if findings:
+            return TaskRefusal(RefusalReason.UNFAITHFUL, findings[0])
+        plan = admit(simulator, task, find_plan, physics=physics)
+        if isinstance(plan, TaskRefusal):
+            return plan
+        plans = self._maker.settings.shortcut_plans
+        found = find_shortcuts(simulator, task, draft.intent, plan, plans)
+        if found.shortcuts:
+            return TaskRefusal(RefusalReason.SHORTCUT, shortcut_in_words(found, task.table))
+        return plan
 
     def _reject(
         self, category: TaskCategory, refusal: TaskRefusal, instruction: str = "", goal: str = ""
@@ -254,7 +271,13 @@ class _VariantWork:
     def _result(self, digest: str) -> VariantResult:
         records = tuple(
             TaskRecord(
-                draft.task, digest, self._order.split, tuple(plan_to_json(plan)), draft.rooms, draft.signature
+                draft.task,
+                digest,
+                self._order.split,
+                tuple(plan_to_json(plan)),
+                draft.rooms,
+                draft.signature,
+                draft.intent,
             )
             for draft, plan in self._admitted
         )

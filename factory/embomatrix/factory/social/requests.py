@@ -9,6 +9,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.values import StrictModel
 from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.world.goal import Atom, Formula, Not
+from embomatrix.world.intent import IntentClause
 from embomatrix.world.state import Relation, State
 
 
@@ -136,4 +137,12 @@ def conjunct_of(requested: RequestedAtom, view: SceneView) -> GoalConjunct:
         else "switch"
     )
     sign = f"{'' if requested.holds else 'not '}{requested.predicate.value}({categories})"
-    return GoalConjunct(atom if requested.holds else Not(atom), "", names, (sign,), kind, requested.thing)
+    return GoalConjunct(
+        atom if requested.holds else Not(atom),
+        "",
+        names,
+        (sign,),
+        kind,
+        requested.thing,
+        intent=(IntentClause(requested.predicate.value, names[:1], names[1:], requested.holds),),
+    )

@@ -13,6 +13,7 @@ from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.words import PHRASES, Voice, room_words, spoken
 from embomatrix.world.asset import JointKind
 from embomatrix.world.goal import And, Atom, Formula, Not, Quantified, Quantifier
+from embomatrix.world.intent import IntentClause
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import flows_from
 
@@ -28,7 +29,8 @@ MAX_PICKS: Final = 4
 class GoalConjunct:
     """Conjunct of a goal. ``objects`` lists all objects involved, ``signs`` its part of the goal's signature.
 
-    ``clause`` is the request, and ``thing`` names the object in words. ``kind`` is "place", "switch" or "thermal".
+    ``intent`` is what the words demand. ``clause`` is the request, and ``thing`` names the object in words. ``kind`` is
+    "place", "switch" or "thermal".
     ``manner`` is set for objects that are switched by a tap or opened by drawers.
     """
 
@@ -40,6 +42,7 @@ class GoalConjunct:
     thing: str
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     manner: str = ""
+    intent: tuple[IntentClause, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,7 @@ def _place_goal(context: GoalContext, thing: str, called: str) -> GoalConjunct |
         kind="place",
         thing=called,
         types=types,
+        intent=(IntentClause(predicate, (thing,), objects),),
     )
 
 
@@ -216,6 +220,7 @@ def switch_goal(context: GoalContext) -> GoalConjunct | None:
         thing=words,
         types=types,
         manner=manner,
+        intent=(IntentClause(predicate, objects, holds=not holds),),
     )
 
 
@@ -260,11 +265,14 @@ def _thermal(context: GoalContext, food: str, source: str, predicate: str) -> Go
     goal: Formula = sources if is_named else Atom(predicate, (food,))
     kinds = [view.category(food), *([view.category(source)] if is_named else [])]
     signs: tuple[str, ...] = (f"{predicate}({','.join(kinds)})",)
+    intent: tuple[IntentClause, ...] = (IntentClause(predicate, (food,), objects if is_named else ()),)
     if view.is_container(source) and len(objects) == 1 and rng.random() < 0.35:
         goal = And((goal, Atom("inside", (food, source))))
         signs = (*signs, f"inside({view.category(food)},{view.category(source)})")
+        intent = (*intent, IntentClause("inside", (food,), (source,)))
         clause += f" and leave it in the {context.noun(source)}"
-    return GoalConjunct(goal, clause, (food, *objects), signs, "thermal", called, types if is_named else {})
+    named_types = types if is_named else {}
+    return GoalConjunct(goal, clause, (food, *objects), signs, "thermal", called, named_types, intent=intent)
 
 
 def serving_goal(context: GoalContext) -> GoalConjunct | None:
@@ -288,4 +296,5 @@ def serving_goal(context: GoalContext) -> GoalConjunct | None:
         kind=first.kind,
         thing=first.thing,
         types={**first.types, **second.types},
+        intent=(*first.intent, *second.intent),
     )

@@ -22,6 +22,7 @@ from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.words import sentence
 from embomatrix.world.evaluate import render
 from embomatrix.world.goal import And, Formula
+from embomatrix.world.intent import IntentClause
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
 Maker = Callable[[GoalContext], GoalConjunct | None]
@@ -60,13 +61,15 @@ _RECIPES: Final[Mapping[TaskCategory, tuple[tuple[Maker, ...], ...]]] = {
 class Draft:
     """Written task whose feasibility is not yet verified.
 
-    ``about`` lists the goal's objects and the appliances that it needs, ``rooms`` their rooms.
+    ``intent`` is what its instruction demands. ``about`` lists the goal's objects and the appliances that it needs, ``rooms``
+    their rooms.
     """
 
     task: Task
     about: tuple[str, ...]
     rooms: tuple[str, ...]
     signature: str
+    intent: tuple[IntentClause, ...] = ()
     transcript: str = ""
     """Conversation behind the request in Markdown; empty if there is none."""
 
@@ -170,6 +173,7 @@ def draft_of(
         about=tuple(needed),
         rooms=tuple(sorted({view.room(name) for name in needed})),
         signature=" ".join(sorted(sign for conjunct in conjuncts for sign in conjunct.signs)),
+        intent=tuple(clause for conjunct in conjuncts for clause in conjunct.intent),
         transcript=transcript,
     )
 

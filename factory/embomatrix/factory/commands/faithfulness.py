@@ -1,0 +1,55 @@
+"""``embomatrix factory audit``: hold the instructions of a dataset against its goals, and search for shortcuts."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from embomatrix.factory.commands.options import Jobs, processes
+from embomatrix.factory.commands.terminal import counter, fail, report_evaluation, say, user_errors
+from embomatrix.factory.evaluate.faithfulness import audit_dataset, evaluation_of, objections, read_plans
+from embomatrix.factory.evaluate.verification import sampled
+from embomatrix.world.dataset import Dataset
+from embomatrix.world.whole_file import check_writable
+
+
+def audit(
+    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
+    plans: Annotated[int, typer.Option(min=0, help="Plans to try for each task.")] = 200,
+    given: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON lines with `task_id` and `plan`: plans of a policy, tried before the others."
+        ),
+    ] = None,
+    sample: Annotated[
+        int | None, typer.Option(min=1, help="Number of tasks to sample. Default: all.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
+    jobs: Jobs = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="File for the figures, for `evaluate --page`.")
+    ] = None,
+) -> None:
+    """Compare what instructions demand with what goals score, and search for plans that succeed against the instruction.
+
+    Exit status 1 if a task has such a plan, or if its instruction and goal disagree.
+    """
+    with user_errors(json_file):
+        if json_file is not None:
+            check_writable(json_file)
+        dataset = Dataset.load(folder)
+        records = sampled(dataset.records, sample, seed)
+        if not records:
+            fail(f"{folder} contains no task: name a dataset with tasks")
+        known = read_plans(given, dataset) if given is not None else {}
+        with counter("tasks", len(records)) as count:
+            audits = audit_dataset(
+                folder, records, plans=plans, given=known, jobs=processes(jobs), progress=count
+            )
+    for line in objections(audits):
+        say(line)
+    conditions = {"dataset": folder.name, "tasks": len(audits), "seed": seed}
+    report_evaluation(evaluation_of(audits, conditions), json_file)
+    if any(each.shortcut or each.findings for each in audits):
+        raise typer.Exit(1)

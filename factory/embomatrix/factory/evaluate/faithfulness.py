@@ -1,0 +1,156 @@
+"""Audit of a dataset: instructions against goals, and a search for plans that succeed against the instruction."""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from embomatrix.factory.faithfulness.instruction import audit, read_intent
+from embomatrix.factory.faithfulness.monitor import PLACED
+from embomatrix.factory.faithfulness.shortcuts import PlanOrigin, find_shortcuts, shortcut_in_words
+from embomatrix.factory.metrics.figures import EvaluationFigures
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.pages.figures import Better, Figure
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.process_pool import process_pool
+from embomatrix.sim.simulation import load_simulator
+from embomatrix.skills.parse import PlanError, plan_from_json
+from embomatrix.skills.syntax import Plan
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+
+SHORTCUT_GOAL: Final = 0.005
+MANY_PLANS: Final = 10_000
+"""Plans for each base scene in a thorough search."""
+GivenPlans = Mapping[str, Sequence[Plan]]
+"""Plans to try, by task id."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskAudit:
+    """Findings about one task.
+
+    ``findings`` are sentences about instruction and goal, ``shortcut`` is one about the first plan that succeeds against the
+    instruction; "" for none. ``swaps`` is True if a plan with another relation than the instruction's succeeds.
+    """
+
+    task: str
+    findings: tuple[str, ...]
+    tried: int
+    succeeded: int
+    shortcut: str
+    placed: bool
+    swaps: bool
+
+
+def audit_dataset(
+    folder: Path,
+    records: Sequence[TaskRecord],
+    *,
+    plans: int,
+    given: GivenPlans,
+    jobs: int,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> list[TaskAudit]:
+    """Audit records of a dataset, with up to ``plans`` plans for each, and call ``progress`` with the number done so far.
+
+    Raises DatasetError if a bundle can't be read or a process dies.
+    """
+    by_bundle: dict[str, list[str]] = {}
+    for record in records:
+        by_bundle.setdefault(record.bundle_digest, []).append(record.task.task_id)
+    found: dict[str, TaskAudit] = {}
+    work = partial(_audit_bundle, folder, plans=plans, given=given)
+    try:
+        with process_pool(jobs) as pool:
+            for group in pool.map(work, by_bundle.items()):
+                found |= {each.task: each for each in group}
+                progress(len(found))
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            "a process that audits tasks died, perhaps out of memory: run the command again with fewer --jobs"
+        ) from error
+    return [found[record.task.task_id] for record in records]
+
+
+def _audit_bundle(
+    folder: Path, tasks: tuple[str, list[str]], *, plans: int, given: GivenPlans
+) -> list[TaskAudit]:
+    """Audit tasks of one bundle. ``tasks`` holds the bundle's digest and the ids of its tasks."""
+    dataset = Dataset.load(folder)
+    bundle = dataset.read_bundle(tasks[0])
+    view = SceneView(bundle.scene)
+    with contextlib.closing(load_simulator(bundle)) as simulator:
+        return [
+            audit_task(simulator, view, dataset.find(name), plans, given.get(name, ())) for name in tasks[1]
+        ]
+
+
+def audit_task(
+    simulator: Simulator, view: SceneView, record: TaskRecord, plans: int, given: Sequence[Plan] = ()
+) -> TaskAudit:
+    """Audit one task. A task whose writer stated no intent is held to its goal and the sources that its words name."""
+    task = record.task
+    intent = record.intent or read_intent(task, view)
+    oracle = plan_from_json(list(record.oracle), task.profile)
+    report = find_shortcuts(simulator, task, intent, oracle, plans, given)
+    return TaskAudit(
+        task.task_id,
+        audit(task, intent, view),
+        report.tried.total(),
+        report.succeeded,
+        shortcut_in_words(report, task.table),
+        any(clause.predicate in PLACED for clause in intent),
+        any(
+            shortcut.origin is PlanOrigin.RELATION or shortcut.violated.predicate in PLACED
+            for shortcut in report.shortcuts
+        ),
+    )
+
+
+def read_plans(path: Path, dataset: Dataset) -> dict[str, list[Plan]]:
+    """Read plans of a policy: JSON lines with ``task_id`` and ``plan``, a list of calls. Raise DatasetError, OSError."""
+    known = {record.task.task_id: record.task.profile for record in dataset.records}
+    found: dict[str, list[Plan]] = {}
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            value = json.loads(line)
+            profile = known.get(value["task_id"])
+            if profile is not None:
+                found.setdefault(value["task_id"], []).append(plan_from_json(value["plan"], profile))
+        except (ValueError, TypeError, KeyError, PlanError) as error:
+            raise DatasetError(
+                f"{path}:{number}: expected a JSON object with task_id and plan, a list of calls ({error})"
+            ) from error
+    return found
+
+
+def evaluation_of(audits: Sequence[TaskAudit], conditions: Mapping[str, Any]) -> EvaluationFigures:
+    """Return the share of tasks with a shortcut, the number of swapped relations, and the share with findings."""
+    plans, low = sum(each.tried for each in audits), Better.LOWER
+    placed = [each.swaps for each in audits if each.placed]
+    shares = {
+        "shortcut_share": [bool(each.shortcut) for each in audits],
+        "unfaithful_share": [bool(each.findings) for each in audits],
+    }
+    figures = [
+        Figure(name, sum(held) / len(held), "share", low, len(held), SHORTCUT_GOAL)
+        for name, held in shares.items()
+    ]
+    figures.insert(1, Figure("relation_swaps", sum(placed), "count", low, len(placed), 0.0))
+    succeeded = sum(each.succeeded for each in audits)
+    figures.append(Figure("plans_tried", plans, "count", Better.HIGHER, len(audits)))
+    notes = (f"{succeeded:,} of {plans:,} plans succeeded.",)
+    return EvaluationFigures("faithfulness", conditions, tuple(figures), notes)
+
+
+def objections(audits: Sequence[TaskAudit]) -> Iterator[str]:
+    """Yield a line for each finding and each shortcut."""
+    for each in audits:
+        for finding in each.findings:
+            yield f"{each.task}: {finding}"
+        if each.shortcut:
+            yield f"{each.task}: {each.shortcut}"
