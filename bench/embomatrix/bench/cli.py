@@ -147,10 +147,18 @@ def adversary(
         bool, typer.Option("--quick", help=f"Send {QUICK_SIEGE.messages:,} messages: a check, not a result.")
     ] = False,
 ) -> None:
-    """Attack a manager with hostile workers, trainers and clients, and measure the harm."""
+    """Attack a manager with hostile workers, trainers and clients, and goals with plans; measure the harm."""
+    from embomatrix.bench.adversary.shortcuts import QUICK_HUNT, HuntSizes, hunt_shortcuts
+
+    siege = replace(QUICK_SIEGE if quick else SiegeSizes(), seed=seed)
+    hunt = replace(QUICK_HUNT if quick else HuntSizes(), seed=seed)
+
+    def measure(on_step: OnStep) -> Sequence[Figure]:
+        return (*bench_adversary(found, siege, on_step), *hunt_shortcuts(hunt, on_step))
+
     with refusals():
-        found, sizes = load_workload(dataset), replace(QUICK_SIEGE if quick else SiegeSizes(), seed=seed)
-        hand_in(_measured("adversary", lambda on_step: bench_adversary(found, sizes, on_step)), json_file)
+        found = load_workload(dataset)
+        hand_in(_measured("adversary", measure), json_file)
 
 
 @app.command()

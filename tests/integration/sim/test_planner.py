@@ -61,6 +61,15 @@ def oracle(simulator, goal):
             "move mug_1; pick_up mug_1; move breakfast_table_1; place breakfast_table_1 under",
         ),
         (
+            atom("hot", "apple_1", "stove_1"),
+            "move apple_1; pick_up apple_1; move stove_1; place stove_1 ontop; toggle_on stove_1",
+        ),
+        (
+            atom("hot", "apple_1", "microwave_1"),
+            "move microwave_1; open microwave_1; move apple_1; pick_up apple_1; move microwave_1; "
+            "place microwave_1 inside; close microwave_1; toggle_on microwave_1",
+        ),
+        (
             atom("inside", "apple_1", "cabinet_1"),
             "move cabinet_1; open cabinet_1; move apple_1; pick_up apple_1; move cabinet_1; place cabinet_1 inside",
         ),
@@ -212,6 +221,10 @@ def test_every_call_of_a_plan_is_necessary(flat):
         (
             atom("ontop", "fridge_1", "countertop_1"),
             "fridge_1 is fixed and can't be picked up",
+        ),
+        (
+            atom("cooked", "apple_1", "fridge_1"),
+            "fridge_1 does not make apple_1 cooked",
         ),
         (
             atom("cooked", "mug_1"),

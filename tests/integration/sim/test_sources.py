@@ -118,3 +118,50 @@ def test_change_is_reported_once(flat):
     after(flat, HEAT_ON_STOVE)
     assert flat.world.let_sources_act() == ()
     assert flat.world.states["apple_1"] == {State.HOT, State.COOKED}
+
+
+HEAT_IN_MICROWAVE = (
+    "move microwave_1; open microwave_1; move apple_1; pick_up apple_1; move microwave_1; "
+    "place microwave_1 inside; close microwave_1; toggle_on microwave_1"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "source", "other"),
+    [
+        (HEAT_ON_STOVE, "stove_1", "microwave_1"),
+        (HEAT_IN_MICROWAVE, "microwave_1", "stove_1"),
+    ],
+)
+def test_state_with_a_source_holds_for_the_source_that_acted(flat, text, source, other):
+    facts = after(flat, text)
+    assert facts.holds("hot", ("apple_1", source))
+    assert not facts.holds("hot", ("apple_1", other))
+
+
+def test_second_source_of_a_hot_object_counts_too(flat):
+    facts = after(
+        flat,
+        f"{HEAT_ON_STOVE}; move microwave_1; open microwave_1; move apple_1; pick_up apple_1; "
+        "move microwave_1; place microwave_1 inside; close microwave_1; toggle_on microwave_1",
+    )
+    assert facts.holds("hot", ("apple_1", "stove_1"))
+    assert facts.holds("hot", ("apple_1", "microwave_1"))
+    assert facts.holds("cooked", ("apple_1", "stove_1"))
+
+
+def test_source_of_an_ended_state_no_longer_counts(flat):
+    assert after(flat, "turn 0").holds("frozen", ("chicken_leg_1", "fridge_1"))
+    facts = after(
+        flat,
+        "move fridge_1; open fridge_1; pick_up chicken_leg_1; move stove_1; place stove_1 ontop; toggle_on stove_1",
+    )
+    assert facts.holds("hot", ("chicken_leg_1", "stove_1"))
+    assert not facts.holds("frozen", ("chicken_leg_1", "fridge_1"))
+
+
+def test_reset_restores_the_sources_of_states(flat):
+    after(flat, HEAT_ON_STOVE)
+    facts = after(flat, "turn 0")
+    assert not facts.holds("hot", ("apple_1", "stove_1"))
+    assert facts.holds("frozen", ("chicken_leg_1", "fridge_1"))

@@ -7,7 +7,13 @@ import typer
 
 from embomatrix.factory.commands.options import Jobs, processes
 from embomatrix.factory.commands.terminal import counter, fail, report_evaluation, say, user_errors
-from embomatrix.factory.evaluate.faithfulness import audit_dataset, evaluation_of, objections, read_plans
+from embomatrix.factory.evaluate.faithfulness import (
+    PolicyAnswers,
+    audit_dataset,
+    evaluation_of,
+    objections,
+    read_answers,
+)
 from embomatrix.factory.evaluate.verification import sampled
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
@@ -16,11 +22,9 @@ from embomatrix.world.whole_file import check_writable
 def audit(
     folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
     plans: Annotated[int, typer.Option(min=0, help="Plans to try for each task.")] = 200,
-    given: Annotated[
+    answers: Annotated[
         Path | None,
-        typer.Option(
-            help="JSON lines with `task_id` and `plan`: plans of a policy, tried before the others."
-        ),
+        typer.Option(help="answers.jsonl of an evaluation: the policy's plans are tried before the others."),
     ] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, help="Number of tasks to sample. Default: all.")
@@ -42,10 +46,10 @@ def audit(
         records = sampled(dataset.records, sample, seed)
         if not records:
             fail(f"{folder} contains no task: name a dataset with tasks")
-        known = read_plans(given, dataset) if given is not None else {}
+        given = read_answers(answers) if answers is not None else PolicyAnswers()
         with counter("tasks", len(records)) as count:
             audits = audit_dataset(
-                folder, records, plans=plans, given=known, jobs=processes(jobs), progress=count
+                folder, records, plans=plans, answers=given, jobs=processes(jobs), progress=count
             )
     for line in objections(audits):
         say(line)

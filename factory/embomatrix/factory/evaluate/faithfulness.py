@@ -4,7 +4,7 @@ import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -18,15 +18,24 @@ from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
-from embomatrix.skills.parse import PlanError, plan_from_json
+from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json
+from embomatrix.skills.prompt import Codec, situation_of, with_indices
 from embomatrix.skills.syntax import Plan
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
 
 SHORTCUT_GOAL: Final = 0.005
 MANY_PLANS: Final = 10_000
 """Plans for each base scene in a thorough search."""
-GivenPlans = Mapping[str, Sequence[Plan]]
-"""Plans to try, by task id."""
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyAnswers:
+    """Texts of a policy by task id, and their form."""
+
+    codec: Codec = Codec.JSON
+    texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +60,7 @@ def audit_dataset(
     records: Sequence[TaskRecord],
     *,
     plans: int,
-    given: GivenPlans,
+    answers: PolicyAnswers,
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> list[TaskAudit]:
@@ -63,7 +72,7 @@ def audit_dataset(
     for record in records:
         by_bundle.setdefault(record.bundle_digest, []).append(record.task.task_id)
     found: dict[str, TaskAudit] = {}
-    work = partial(_audit_bundle, folder, plans=plans, given=given)
+    work = partial(_audit_bundle, folder, plans=plans, answers=answers)
     try:
         with process_pool(jobs) as pool:
             for group in pool.map(work, by_bundle.items()):
@@ -77,7 +86,7 @@ def audit_dataset(
 
 
 def _audit_bundle(
-    folder: Path, tasks: tuple[str, list[str]], *, plans: int, given: GivenPlans
+    folder: Path, tasks: tuple[str, list[str]], *, plans: int, answers: PolicyAnswers
 ) -> list[TaskAudit]:
     """Audit tasks of one bundle. ``tasks`` holds the bundle's digest and the ids of its tasks."""
     dataset = Dataset.load(folder)
@@ -85,7 +94,14 @@ def _audit_bundle(
     view = SceneView(bundle.scene)
     with contextlib.closing(load_simulator(bundle)) as simulator:
         return [
-            audit_task(simulator, view, dataset.find(name), plans, given.get(name, ())) for name in tasks[1]
+            audit_task(
+                simulator,
+                view,
+                record,
+                plans,
+                _plans_in(answers, bundle.scene, record.task),
+            )
+            for record in map(dataset.find, tasks[1])
         ]
 
 
@@ -111,21 +127,31 @@ def audit_task(
     )
 
 
-def read_plans(path: Path, dataset: Dataset) -> dict[str, list[Plan]]:
-    """Read plans of a policy: JSON lines with ``task_id`` and ``plan``, a list of calls. Raise DatasetError, OSError."""
-    known = {record.task.task_id: record.task.profile for record in dataset.records}
-    found: dict[str, list[Plan]] = {}
+def read_answers(path: Path) -> PolicyAnswers:
+    """Read the stored answers of an evaluation. Raise DatasetError for another file, OSError."""
+    codec, texts = Codec.JSON, dict[str, list[str]]()
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         try:
             value = json.loads(line)
-            profile = known.get(value["task_id"])
-            if profile is not None:
-                found.setdefault(value["task_id"], []).append(plan_from_json(value["plan"], profile))
-        except (ValueError, TypeError, KeyError, PlanError) as error:
+            if number == 1:
+                codec = Codec(value["codec"])
+            else:
+                texts.setdefault(str(value["task_id"]), []).append(str(value["text"]))
+        except (ValueError, TypeError, KeyError) as error:
             raise DatasetError(
-                f"{path}:{number}: expected a JSON object with task_id and plan, a list of calls ({error})"
+                f"{path}:{number} is no answer of an evaluation ({error}): name the answers.jsonl that `embomatrix eval` wrote"
             ) from error
-    return found
+    return PolicyAnswers(codec, texts)
+
+
+def _plans_in(answers: PolicyAnswers, scene: Scene, task: Task) -> list[Plan]:
+    """Return the plans in a policy's answers. Texts without one are left out."""
+    situation, plans = situation_of(scene, task), list[Plan]()
+    for text in answers.texts.get(task.task_id, ()):
+        named = with_indices(text, situation) if answers.codec is Codec.NAMES else text
+        with contextlib.suppress(PlanError):
+            plans.append(parse_plan(named, task.profile))
+    return plans
 
 
 def evaluation_of(audits: Sequence[TaskAudit], conditions: Mapping[str, Any]) -> EvaluationFigures:

@@ -43,6 +43,13 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "the share that is admitted again. *reverified_bit_equal* is the share with the dataset's plan and with bit-identical "
         "poses and states after every step. *oracle_physical* is the share whose plan a robot executes in stepped physics.",
     ),
+    "faithfulness": (
+        "Faithful goals",
+        "`embomatrix factory audit DATASET --plans N` compares what each instruction demands with what its goal scores, and "
+        "searches for shortcuts: plans that succeed while they violate a relation, source or object that the instruction "
+        "states. *shortcut_share* is the share of tasks with one, *relation_swaps* the number of placement tasks solved with "
+        "another relation, *unfaithful_share* the share of tasks whose words and goal disagree.",
+    ),
     "aesthetics": (
         "Aesthetics",
         "`embomatrix factory evaluate aesthetics` computes a geometric score of 0 to 10. Its weights are fitted to give "

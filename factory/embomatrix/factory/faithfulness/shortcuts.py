@@ -44,7 +44,7 @@ class PlanOrigin(StrEnum):
 
     GIVEN = "given"
     RELATION = "relation"  # the oracle's plan with another relation in a place call
-    OBJECT = "object"  # the oracle's plan with one object replaced by another
+    OBJECT = "object"  # the oracle's plan with one object replaced by another, without calls that then fail
     DROPPED = "dropped"  # the oracle's plan without some calls
     GREEDY = "greedy"
     RANDOM = "random"
@@ -86,7 +86,9 @@ def find_shortcuts(
         (PlanOrigin.DROPPED, _dropped(oracle)),
     ):
         for plan in tries:
-            search.run(origin, plan)
+            if search.is_over:
+                break
+            search.run(origin, search.without_failures(plan) if origin is PlanOrigin.OBJECT else plan)
     search.greedy()
     search.random()
     return search.report
@@ -121,9 +123,18 @@ class _Search:
         self._rng = rng
         self._known: set[Plan] = set()
 
+    @property
+    def is_over(self) -> bool:
+        return self._left <= 0
+
+    def without_failures(self, plan: Plan) -> Plan:
+        """Return the calls of a plan that succeed one after the other: another object may need fewer calls."""
+        self._simulator.reset(self._task, SEED)
+        return tuple(call for call in plan if self._simulator.run_step(call).ok)
+
     def run(self, origin: PlanOrigin, plan: Plan) -> WatchedRun | None:
         """Execute a new plan; None if it is known or too long, or no plans are left."""
-        if not 0 < len(plan) <= MAX_STEPS or plan in self._known or self._left <= 0:
+        if not 0 < len(plan) <= MAX_STEPS or plan in self._known or self.is_over:
             return None
         self._known.add(plan)
         self._left -= 1
@@ -154,7 +165,7 @@ class _Search:
 
     def random(self) -> None:
         low, high = RANDOM_ACTIONS
-        while self._left > 0:
+        while not self.is_over:
             before = self._left
             sampler = PlanSampler(self._simulator, self._task, SEED, self._rng)
             for _ in range(int(self._rng.integers(low, high + 1))):
