@@ -108,14 +108,14 @@ def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArr
 
 
 def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:
-    """Poses at proposed places at which the relation holds."""
+    """Poses at proposed places, from which the object comes to rest in the relation."""
     bounds = bounds_of(held)
     found = patches(bounds, support, relation)
     places = proposed_places(found, shift, tries).tolist()
     for patch, (x, y, z) in zip(itertools.cycle(found), places, strict=False):
-        pose = Pose.from_xyz_yaw(x, y, z, patch.yaw)
-        if _stands(bounds.box(pose), support, relation):
-            yield pose
+        at_rest = Pose.from_xyz_yaw(x, y, z - LIFT_M, patch.yaw)
+        if _stands(bounds.box(at_rest), support, relation):
+            yield Pose.from_xyz_yaw(x, y, z, patch.yaw)
 
 
 def beside(held: Asset, support: Asset, relation: Relation, neighbour: Aabb) -> Iterator[Pose]:
