@@ -19,6 +19,7 @@ from embomatrix.manager.control.events import (
     RunClosed,
     RunOpened,
     Tick,
+    WorkerFaulted,
     WorkerJoined,
     WorkerLost,
     WorkerReported,
@@ -393,3 +394,17 @@ def test_newcomers_confirm_each_other_and_are_then_trusted():
     assert len(bench.results) == 200
     assert bench.stats().audited <= 2 * (10 + 32)
     assert not any(w.most_unconfirmed for w in bench.cluster.dispatcher.workers.values())
+
+
+def test_two_checks_of_one_rollout_in_one_queue_have_an_order():
+    """A check of a closed case leaves its entry in the queue, and the next check of its rollout has the same position."""
+    bench = Bench(workers=("w1", "w2"))
+    bench.submit(2)
+    bench.answer(lies={"w2"})
+    assert not bench.results, "both rollouts wait for a third worker"
+    bench.apply(WorkerFaulted("w2", "its message made no sense"))
+    bench.apply(DrainChanged("w2", drained=False))
+    bench.answer(lies={"w2"})
+    bench.join("w3")
+    bench.answer(lies={"w2"})
+    assert len(bench.results) == 2

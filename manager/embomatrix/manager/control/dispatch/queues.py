@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 
 from embomatrix.manager.control.dispatch.records import DispatchPhase, FairShareTurn, QueueKey, RolloutRecord
 from embomatrix.manager.control.workers import WorkerRecord
 
-_Heap = list[tuple[int, RolloutRecord]]
+_Heap = list[tuple[int, int, RolloutRecord]]
+"""Entries of sequence, number and record. The number is unique: two checks of one rollout have the same sequence."""
 
 
 class PendingQueues:
@@ -23,6 +25,7 @@ class PendingQueues:
         #: Waiting rollouts by scene; no zero entries.
         self._by_run: Counter[str] = Counter()
         #: Waiting rollouts by run; no zero entries.
+        self._numbers = itertools.count()
 
     def __len__(self) -> int:
         return sum(self._by_run.values())
@@ -31,7 +34,7 @@ class PendingQueues:
         """Yield every waiting rollout, in no order."""
         for queues in self._heaps.values():
             for heap in queues.values():
-                yield from (record for _, record in heap if record.phase is DispatchPhase.PENDING)
+                yield from (record for *_, record in heap if record.phase is DispatchPhase.PENDING)
 
     @property
     def scene_count(self) -> int:
@@ -50,7 +53,7 @@ class PendingQueues:
     def push(self, record: RolloutRecord) -> None:
         record.phase = DispatchPhase.PENDING
         heap = self._heaps.setdefault(record.scene, {}).setdefault(record.queue, [])
-        heapq.heappush(heap, (record.sequence, record))
+        heapq.heappush(heap, (record.sequence, next(self._numbers), record))
         self._counts[record.scene] += 1
         self._by_run[record.key.run_id] += 1
 
@@ -76,10 +79,10 @@ class PendingQueues:
     def take(self, record: RolloutRecord) -> None:
         """Move a waiting record out of its queue: it is leased next."""
         heap = self._heaps[record.scene][record.queue]
-        if heap[0][1] is record:
+        if heap[0][-1] is record:
             heapq.heappop(heap)
         else:
-            heap.remove((record.sequence, record))
+            del heap[next(index for index, entry in enumerate(heap) if entry[-1] is record)]
             heapq.heapify(heap)
         self.uncount(record)
         record.phase = DispatchPhase.LEASED
@@ -151,9 +154,9 @@ class Choice:
 
 
 def _head(heap: _Heap) -> RolloutRecord | None:
-    while heap and heap[0][1].phase is not DispatchPhase.PENDING:
+    while heap and heap[0][-1].phase is not DispatchPhase.PENDING:
         heapq.heappop(heap)
-    return heap[0][1] if heap else None
+    return heap[0][-1] if heap else None
 
 
 def _first_taken(heap: _Heap, worker: WorkerRecord, now_s: float) -> RolloutRecord | None:
@@ -168,7 +171,7 @@ def _first_taken(heap: _Heap, worker: WorkerRecord, now_s: float) -> RolloutReco
     frontier = [(heap[0][0], 0)]
     while frontier:
         _, index = heapq.heappop(frontier)
-        record = heap[index][1]
+        record = heap[index][-1]
         if record.phase is DispatchPhase.PENDING:
             if worker.takes(record, now_s):
                 return record
