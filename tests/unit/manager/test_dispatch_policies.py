@@ -404,10 +404,15 @@ def test_needs_keep_their_order_and_runs_their_weights(entries, weights):
             assert all(spent[need.share.run_id] <= spent[run] + 9.0 / weights[run] + 1e-9 for run in behind)
 
 
+def test_run_with_a_tiny_weight_beside_a_large_one_gets_the_slots_that_are_left():
+    large, small = RunShare("large", 1e6), RunShare("small", 1e-300)
+    assert quotas({large: 1, small: 5}, 4) == {large: 1.0, small: 3.0}
+
+
 @given(
     st.dictionaries(
         st.builds(
-            RunShare, st.text("abcdef", min_size=1), st.sampled_from([0.5, 1.0, 3.0]), st.integers(0, 1)
+            RunShare, st.text("abcdef", min_size=1), st.sampled_from([1e-3, 0.5, 3.0, 1e6]), st.integers(0, 1)
         ),
         st.integers(0, 100),
         min_size=1,

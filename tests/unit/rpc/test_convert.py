@@ -223,9 +223,16 @@ def test_empty_run_terms_are_the_defaults():
     assert convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(name="old")) == RunTerms()
 
 
-def test_weight_below_zero_is_refused_with_its_field():
-    with pytest.raises(ConvertError, match=r"weight: found -1\.0"):
-        convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(weight=-1.0))
+@pytest.mark.parametrize("weight", [-1.0, 1e-300, 9e-4])
+def test_weight_without_a_usable_inverse_is_refused_with_its_field(weight):
+    with pytest.raises(ConvertError, match=f"weight: found {weight}"):
+        convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(weight=weight))
+
+
+@pytest.mark.parametrize(("weight", "meant"), [(0.0, 1.0), (1e-3, 1e-3), (2.5, 2.5)])
+def test_weight_of_zero_stands_for_the_default(weight, meant):
+    message = rollout_service_pb2.OpenRunRequest(weight=weight)
+    assert convert_run.run_terms_from_proto(message).weight == meant
 
 
 @given(st.builds(GroupDone, NAMES, UINT32, UINT32, UINT32))

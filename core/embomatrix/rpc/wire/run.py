@@ -16,6 +16,8 @@ from embomatrix.rpc.wire.values import (
     Warmth,
 )
 
+LEAST_WEIGHT: Final = 1e-3
+"""Smallest weight of a run. Slot time is divided by it: a much smaller one makes turns that no number can hold."""
 WARMTHS: Final = enum_numbers(Warmth, types_pb2.Warmth, "WARMTH")
 
 lookahead_entry_to_proto, lookahead_entry_from_proto = converters(
@@ -57,7 +59,10 @@ run_terms_to_proto, _terms_from_proto = converters(
 
 def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerms:
     terms = _terms_from_proto(message)
-    for field in ("weight", "rollout_deadline_s"):
-        if getattr(message, field) < 0:
-            raise ConvertError(field, f"found {getattr(message, field)}: expected 0 or more")
+    if message.rollout_deadline_s < 0:
+        raise ConvertError("rollout_deadline_s", f"found {message.rollout_deadline_s}: expected 0 or more")
+    if terms.weight < LEAST_WEIGHT:
+        raise ConvertError(
+            "weight", f"found {message.weight}: expected {LEAST_WEIGHT} or more, or 0 for the default"
+        )
     return terms

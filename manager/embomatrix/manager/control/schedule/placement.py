@@ -49,13 +49,14 @@ def quotas(wanted: Mapping[RunShare, int], slots: int) -> dict[RunShare, float]:
     left = float(slots)
     given: dict[RunShare, float] = {}
     for priority in sorted({share.priority for share in wanted}, reverse=True):
-        weights = sum(share.weight for share in wanted if share.priority == priority)
         equals = [share for share in wanted if share.priority == priority]
         # Runs that want least for their weight are served in full; the others share the rest.
-        for share in sorted(equals, key=lambda share: (wanted[share] / share.weight, share.run_id)):
-            given[share] = min(float(wanted[share]), left * share.weight / weights)
+        equals.sort(key=lambda share: (wanted[share] / share.weight, share.run_id))
+        # Summed from the end: subtracting a large weight from a sum loses the small ones.
+        weights = [*itertools.accumulate(share.weight for share in reversed(equals))]
+        for share, weight in zip(equals, reversed(weights), strict=True):
+            given[share] = min(float(wanted[share]), left * share.weight / weight)
             left -= given[share]
-            weights -= share.weight
     return given
 
 
