@@ -381,3 +381,14 @@ def test_history_of_a_redispatched_rollout_names_workers_reasons_and_causes(tabl
     ]
     assert steps[2].reason == "worker lost: killed"
     assert (state.where("b1-0"), state.explain("b1-9")) == ("", [])
+
+
+def test_failure_names_the_worker_that_reported_it_whatever_it_says(table):
+    table.worker("w1")
+    table.worker("w2", warm=())
+    commands = table.submit()
+    while not table.results:
+        (lease,) = leases(commands)
+        table.finish(lease, InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", "w2"))
+        commands = table.apply(Tick(), after_s=6.0)
+    assert table.results["b1-0"].outcome.worker_id == "w1"

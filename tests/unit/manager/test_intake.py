@@ -1,15 +1,18 @@
 """Order of worker reports in the state machines."""
 
+from dataclasses import replace
+
 import pytest
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.cluster_state import ClusterState
-from embomatrix.manager.control.commands import CancelLease, GiveLease
-from embomatrix.manager.control.events import BatchSubmitted
+from embomatrix.manager.control.commands import CancelLease, DeliverResult, GiveLease, QuarantineWorker
+from embomatrix.manager.control.dispatch.leases import lease_id_of
+from embomatrix.manager.control.events import BatchRestored, BatchSubmitted
 from embomatrix.manager.runtime.intake import Heartbeat, Intake
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
 from embomatrix.rpc.status import SupersededError
-from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
+from embomatrix.rpc.wire.leases import LeaseClaim, LeaseOrigin, LeaseRef, LeaseResult, WorkerState
 from embomatrix.rpc.wire.values import (
     Batch,
     Resident,
@@ -54,6 +57,25 @@ def test_lease_granted_for_first_state_results_is_not_lost():
         second.lease_id,
         *(lease.ref.lease_id for lease in more),
     }
+
+
+def test_impossible_result_of_a_claimed_lease_is_not_delivered():
+    """The manager that gave the lease has ended; its successor adopts the claim and checks the result in one message."""
+    cluster = ClusterState(lease_key=b"key", first_epoch=1 << 32)
+    intake = Intake(cluster, Registry(LivenessLimits(), first_epoch=1 << 32))
+    cluster.handle(
+        BatchRestored(Batch("r", "b", 1, (Rollout("x0", "g", "kitchen", "t", (), 0),)), {}), now_s=0.0
+    )
+    session, _ = intake.register("w1", "boot-1", Resources(1, 1, 1000), now_s=0.1)
+    origin = LeaseOrigin("r", "b", "x0", 1)
+    ref = LeaseRef(lease_id_of(b"key", origin, "w1", 7), 7)
+    honest = completed()
+    lie = replace(honest, reward=replace(honest.reward, goal=1e9))
+    state = WorkerState(WARM, (), (LeaseResult(ref, lie),), claims=(LeaseClaim(ref, origin),))
+    commands = intake.report(session, state, (), resync=True, now_s=0.2)
+    assert not [command for command in commands if isinstance(command, DeliverResult)]
+    (caught,) = [command for command in commands if isinstance(command, QuarantineWorker)]
+    assert "its result of x0 is impossible: its goal reward is 1e+09" in caught.reason
 
 
 def test_returning_suspect_holds_each_rollout_once():

@@ -38,8 +38,9 @@ def _wrong_reward(reward: RewardBreakdown, steps: tuple[Step, ...], settings: Re
         return f"its format reward is {reward.format:g} instead of {settings.format:g}"
     if reward.goal != goal:
         return f"its goal reward is {reward.goal:g}, and its atoms earn {goal:g}"
-    if reward.success and not satisfied:
-        return "it succeeds without an atom that holds"
+    if reward.success != (0 < len(reward.atoms) == satisfied):
+        said = "succeeds" if reward.success else "fails"
+        return f"it {said}, and {satisfied} of its {len(reward.atoms)} atoms hold"
     return "" if _is_relevance(reward.relevance, steps, settings) else _irrelevant(reward.relevance)
 
 

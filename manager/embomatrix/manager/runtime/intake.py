@@ -15,13 +15,11 @@ from embomatrix.manager.control.events import (
     LeaseFinished,
     LeasesRenewed,
     Tick,
-    WorkerFaulted,
     WorkerLost,
     WorkerReported,
 )
-from embomatrix.manager.control.plausibility import contradiction
 from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
-from embomatrix.rpc.wire.values import Completed, Resources
+from embomatrix.rpc.wire.values import Resources
 
 if TYPE_CHECKING:
     from embomatrix.manager.control.cluster_state import ClusterState
@@ -74,7 +72,7 @@ class Intake:
         session = self.registry.find(session.session_id, session.epoch)
         finished = (*(state.finished if state is not None else ()), *results)
         events: list[Event] = self.registry.heard(session, now_s=now_s)
-        events += [self._finished(session.worker_id, result) for result in finished]
+        events += [LeaseFinished(session.worker_id, result.ref, result.outcome) for result in finished]
         if state is not None:
             self.registry.note_state(session, draining=state.draining, paused=state.paused)
             held = (*state.running, *(result.ref for result in state.finished))
@@ -84,17 +82,6 @@ class Intake:
             # The first state precedes its results: leases given on the strength of those results were not in it yet.
             events.insert(0 if resync else len(events), reported)
         return self.cluster.handle(*events, now_s=now_s)
-
-    def _finished(self, worker_id: str, result: LeaseResult) -> Event:
-        """Return the end of a lease, or the fault of a worker whose result contradicts itself."""
-        lease = self.cluster.dispatcher.live_leases.get(result.ref.lease_id)
-        if lease is not None and isinstance(result.outcome, Completed):
-            wrong = contradiction(result.outcome, lease.record.rollout, lease.record.reward)
-            if wrong:
-                return WorkerFaulted(
-                    worker_id, f"its result of {lease.record.key.rollout_id} is impossible: {wrong}"
-                )
-        return LeaseFinished(worker_id, result.ref, result.outcome)
 
     def heartbeat(
         self, session_id: str, epoch: int, beat: Heartbeat, *, now_s: float

@@ -3,18 +3,22 @@
 import dataclasses
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease
-from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit
+from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit, quarantine
 from embomatrix.manager.control.dispatch.leasing import offer_scene
 from embomatrix.manager.control.dispatch.outcomes import requeue
 from embomatrix.manager.control.dispatch.records import LeaseRecord
 from embomatrix.manager.control.dispatch.state import DispatchState
 from embomatrix.manager.control.events import LeaseFinished
+from embomatrix.manager.control.plausibility import contradiction
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraCode, InfraFailure
 
 
 def settle_result(state: DispatchState, event: LeaseFinished) -> None:
-    """Acknowledge a reported result, and use it if its lease is live. Any other result is stale and dropped."""
+    """Acknowledge a reported result, and use it if its lease is live. Any other result is stale and dropped.
+
+    A worker with an impossible result is put in quarantine.
+    """
     state.emit(AcknowledgeLease(event.worker_id, event.ref))
     lease = state.leases.find(event.worker_id, event.ref)
     if lease is None:
@@ -24,10 +28,14 @@ def settle_result(state: DispatchState, event: LeaseFinished) -> None:
         return
     match event.outcome:
         case Completed() as completed:
-            _complete(state, lease, completed)
+            wrong = contradiction(completed, lease.record.rollout, lease.record.reward)
+            if wrong:
+                reason = f"its result of {lease.record.key.rollout_id} is impossible: {wrong}"
+                quarantine(state, event.worker_id, reason)
+            else:
+                _complete(state, lease, completed)
         case InfraFailure() as failure:
-            worker_id = failure.worker_id or event.worker_id
-            _fail(state, lease, dataclasses.replace(failure, worker_id=worker_id))
+            _fail(state, lease, dataclasses.replace(failure, worker_id=event.worker_id))
 
 
 def give_back(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, counted: bool) -> None:
