@@ -99,6 +99,17 @@ def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
             return (formula,)
 
 
+def count_scored_atoms(formula: Formula, types: Types) -> int:
+    """Number of scored sub-goals. Makes none of them: nested quantifiers may have more than fit in memory."""
+    match formula:
+        case And(parts):
+            return sum(count_scored_atoms(part, types) for part in parts)
+        case Quantified(Quantifier.FORALL, ((_, type_name),), body):
+            return len(_members(type_name, types)) * count_scored_atoms(body, types)
+        case _:
+            return 1
+
+
 def expand(formula: Formula, types: Types) -> Atom | Not | And | Or | Quantified:
     """Rewrite an outermost implication, ``forall`` or ``exists`` with ``not``, ``and`` and ``or``."""
     match formula:

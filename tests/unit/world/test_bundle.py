@@ -84,6 +84,26 @@ def test_bundle_of_the_first_format_names_the_remedy() -> None:
         decode_bundle(zlib.compress(b'{"format":1,"scene":{}}'))
 
 
+@pytest.mark.parametrize(
+    ("goal", "atoms"), [("(and)", "0"), ("(and (and) (and))", "0"), ("(forall (?x - apple.n.01) (and))", "0")]
+)
+def test_goal_without_an_atom_is_refused(bundle: Bundle, task: Task, goal: str, atoms: str) -> None:
+    """It holds whatever the robot does, and no result of it agrees with its atoms."""
+    vacuous = dataclasses.replace(task, goal_bddl=goal)
+    with pytest.raises(BundleError, match=rf"goal: has {atoms} scored atoms: expected 1 to 1,024"):
+        decode_bundle(encode_bundle(dataclasses.replace(bundle, tasks={task.task_id: vacuous})))
+
+
+def test_goal_with_more_atoms_than_a_result_may_have_is_refused(bundle: Bundle, task: Task) -> None:
+    """Each quantifier over two objects doubles the atoms."""
+    nested = "(open fridge_1)"
+    for number in range(11):
+        nested = f"(forall (?x{number} - thing) {nested})"
+    many = dataclasses.replace(task, goal_bddl=nested, types={"thing": ("apple_1", "fridge_1")})
+    with pytest.raises(BundleError, match="has 2,048 scored atoms"):
+        decode_bundle(encode_bundle(dataclasses.replace(bundle, tasks={task.task_id: many})))
+
+
 def test_task_of_another_scene_is_not_bundled(bundle: Bundle, task: Task) -> None:
     stray = dataclasses.replace(task, scene_id="elsewhere")
     with pytest.raises(BundleError, match="belongs to scene 'elsewhere'"):

@@ -11,6 +11,7 @@ from embomatrix.world.bddl import parse_formula
 from embomatrix.world.evaluate import (
     GoalError,
     atoms_of,
+    count_scored_atoms,
     evaluate,
     objects_of,
     render,
@@ -100,6 +101,18 @@ def test_scored_atoms_are_conjuncts_after_grounding_and_other_operators_count_on
         "(or (hot lamp_1) (open box_2))",
         PAIRS,
     ]
+
+
+@pytest.mark.parametrize("text", ["(and)", EVERY, PAIRS, f"(and {EVERY} (and {PAIRS} (or)) (hot lamp_1))"])
+def test_scored_atoms_are_counted(text: str) -> None:
+    assert count_scored_atoms(goal(text), TYPES) == len(scored_atoms(goal(text), TYPES))
+
+
+def test_atoms_of_nested_quantifiers_are_counted_without_making_them() -> None:
+    formula = goal("(open box_1)")
+    for number in range(40):
+        formula = forall(f"?x{number}", "apple", formula)
+    assert count_scored_atoms(formula, TYPES) == 2**40
 
 
 def test_unknown_type_and_free_variable_are_named() -> None:
