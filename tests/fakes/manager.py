@@ -11,6 +11,7 @@ from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import SERVER_OPTIONS, chunks_of
 from embomatrix.rpc.status import NotFoundError, SupersededError, translate
+from embomatrix.rpc.wire.bounds import parsed
 from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.session import (
     lease_ref_to_proto,
@@ -59,9 +60,9 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
         self.outgoing.put_nowait(pb.SessionResponse(leases=[lease_to_proto(lease)]))
         return lease.ref
 
-    def leases(self, count, digest):
+    def leases(self, count, digest, task="ok"):
         """Send several leases in one message."""
-        rollouts = (Rollout(f"l{number}", "g", digest, "ok", (), 1) for number in range(count))
+        rollouts = (Rollout(f"l{number}", "g", digest, task, (), 1) for number in range(count))
         leases = (Lease(LeaseRef(one.rollout_id, self.epoch), one, 60.0) for one in rollouts)
         self.outgoing.put_nowait(pb.SessionResponse(leases=list(map(lease_to_proto, leases))))
 
@@ -136,6 +137,7 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
             self._take(request)
 
     def _take(self, request):
+        parsed(pb.SessionRequest, request.SerializeToString())  # its bounds, as in a real manager
         found = list(request.results)
         self.deliveries += bool(found)
         if request.HasField("state"):

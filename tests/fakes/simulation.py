@@ -56,6 +56,7 @@ class FakeScene:
         self._executed += 1
         times = note(rollout.rollout_id)
         on_step(1)
+        words = ()
         match rollout.task_id:
             case "first slow":
                 time.sleep(3.0 if times == 1 else 0.01)
@@ -82,6 +83,10 @@ class FakeScene:
                 self._ballast = bytearray(b"x") * (150 * 1024 * 1024)
             case "greedy":
                 self._ballast = bytearray(4 * 1024 * 1024 * 1024)
+            case "long":
+                words = ("x" * 3000,) * 20
+            case "endless":
+                words = ("x" * 3000,) * 40
             case "orphan":
                 os.kill(os.getppid(), signal.SIGKILL)
                 time.sleep(600)
@@ -94,7 +99,7 @@ class FakeScene:
         return Completed(
             reward=RewardBreakdown(reward.format, 0.0, reward.goal * sum(holds) / 3, atoms, all(holds)),
             steps=tuple(Step(call, None, "done") for call in rollout.plan),
-            final=(f"executed {self._executed} in {os.getpid()} of {os.getppid()}",),
+            final=(f"executed {self._executed} in {os.getpid()} of {os.getppid()}", *words),
             trace_digest=f"{'no ' if made_up else ''}trace of {rollout.rollout_id}",
             worker_id="",
             timings=Timings(),

@@ -17,7 +17,7 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout, Warmth
+from embomatrix.rpc.wire.values import Batch, Completed, InfraFailure, LookaheadEntry, Rollout, Warmth
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.bundle import Bundle, encode_bundle
@@ -148,6 +148,19 @@ async def test_announced_scene_is_warm_before_it_is_needed(tmp_path):
                 await asyncio.sleep(0.05)
         results = [result async for result in client.execute(_batch(run_id, [digest], 8), deadline_s=30.0)]
     assert all(result.outcome.warm for result in results)
+
+
+async def test_result_that_a_manager_would_refuse_fails_its_rollout_and_not_the_worker(tmp_path):
+    async with cluster(tmp_path, "w1") as (made, client):
+        [digest] = await _put(client, b"ok")
+        run_id = await client.open_run("test")
+        for task, kind in (("endless", InfraFailure), ("long", Completed)):
+            batch = _batch(run_id, [digest], 1, task, batch_id=task)
+            (result,) = [result async for result in client.execute(batch, deadline_s=60.0)]
+            assert isinstance(result.outcome, kind)
+            if kind is InfraFailure:
+                assert "the result can't be sent: outcome: found 120," in result.outcome.message
+        assert made.processes["w1"].poll() is None
 
 
 async def test_worker_killed_in_the_middle_costs_no_rollout(tmp_path):

@@ -98,6 +98,20 @@ async def test_results_share_messages_while_slots_have_enough_leases(tmp_path, m
     assert manager.deliveries < 100
 
 
+async def test_results_beyond_one_message_are_resent_in_several(tmp_path):
+    """Six MB of results, where a message may have four: the fake checks each message as a manager does."""
+    manager = FakeManager(acknowledging=False)
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path) as (_, task):
+        manager.leases(100, digest, "long")
+        await _until(lambda: len(manager.results) == 100)
+        sent = len(manager.states)
+        manager.break_stream()
+        await _until(lambda: len(manager.results) == 200 or task.done())
+        assert len(set(_done(manager))) == 100
+        assert len(manager.states[sent].running) == 100
+
+
 async def test_broken_stream_is_reopened_and_unacknowledged_results_are_resent(tmp_path):
     manager = FakeManager(acknowledging=False)
     digest = manager.bundle(b"ok")

@@ -18,6 +18,7 @@ from embomatrix.manager.control.events import (
     WorkerJoined,
     WorkerLost,
 )
+from embomatrix.rpc.wire.bounds import HELD_LEASES
 from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef
 from embomatrix.rpc.wire.values import (
     Batch,
@@ -392,3 +393,10 @@ def test_failure_names_the_worker_that_reported_it_whatever_it_says(table):
         table.finish(lease, InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", "w2"))
         commands = table.apply(Tick(), after_s=6.0)
     assert table.results["b1-0"].outcome.worker_id == "w1"
+
+
+def test_quick_worker_with_many_slots_holds_no_more_leases_than_its_messages_may_name(table):
+    table.worker(slots=1000)
+    (lease,) = leases(table.submit())
+    table.finish(lease)
+    assert table.dispatcher.workers["w1"].credits == HELD_LEASES

@@ -30,6 +30,17 @@ def test_result_is_sent_once_per_stream_and_kept():
     assert len(outbox) == 3
 
 
+def test_message_of_results_stays_below_the_manager_s_bound():
+    outbox = ResultOutbox()
+    most = module.MESSAGE_BYTES // 3
+    for number in range(5):
+        failure = InfraFailure(InfraCode.SLOT_CRASHED, "x" * most)
+        outbox.put(LeaseResult(LeaseRef(f"l{number}", 1), failure))
+    assert [len(outbox.take_unsent(256)) for _ in range(3)] == [2, 2, 1]
+    outbox.begin_stream()
+    assert outbox.unsent() == tuple(LeaseRef(f"l{number}", 1) for number in range(5))
+
+
 def test_new_stream_sends_unacknowledged_results():
     outbox = _filled(3)
     outbox.take_unsent(3)

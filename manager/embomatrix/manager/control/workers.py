@@ -9,6 +9,7 @@ from typing import Final
 from embomatrix.manager.control.dispatch.fair_share import SlotTimes
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
 from embomatrix.manager.control.events import DrainChanged, SuspicionChanged, WorkerReported
+from embomatrix.rpc.wire.bounds import HELD_LEASES
 from embomatrix.rpc.wire.values import Resources
 
 AHEAD_S: Final = 0.2
@@ -132,7 +133,7 @@ class WorkerRecord:
         self.completed += 1
         self.pace_s += weight * (execute_s - self.pace_s)
         behind = math.ceil(AHEAD_S / self.pace_s) if self.pace_s * BEHIND > AHEAD_S else BEHIND
-        self.credits = self.slots * (1 + behind)
+        self.credits = min(self.slots * (1 + behind), HELD_LEASES)
 
     def begins_soon(self, now_s: float) -> bool:
         """True if one of the slots is predicted to start the last lease, queued behind it, now: see ``BEGINS_S``."""

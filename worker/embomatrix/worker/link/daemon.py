@@ -28,7 +28,10 @@ from embomatrix.rpc.status import (
     UnavailableError,
     UnknownSessionError,
 )
+from embomatrix.rpc.wire.bounds import RESULT_TEXT, SENTENCE, check_result
+from embomatrix.rpc.wire.codec import ConvertError
 from embomatrix.rpc.wire.leases import LeaseResult
+from embomatrix.rpc.wire.session import lease_result_to_proto
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Resources
 from embomatrix.worker.host.machine import HostMachine, Probe
 from embomatrix.worker.host.settings import WorkerSettings
@@ -328,7 +331,7 @@ class Daemon:
     def _take_result(self, result: LeaseResult) -> None:
         """Queue a result for the manager, with this worker's name."""
         self._counts[type(result.outcome)] += 1
-        self._outbox.put(signed(result, self._membership.name))
+        self._outbox.put(sendable(signed(result, self._membership.name)))
         if self._session is not None:
             self._session.notify()
 
@@ -355,6 +358,23 @@ def signed(result: LeaseResult, name: str) -> LeaseResult:
         outcome = replace(result.outcome, worker_id=name)
         logger.warning("rollout failed lease=%s %s: %s", result.ref.lease_id, outcome.code, outcome.message)
     return replace(result, outcome=outcome)
+
+
+def sendable(result: LeaseResult) -> LeaseResult:
+    """Return the result, or in its place a failure if the manager would refuse it, and with it this worker's stream."""
+    outcome = result.outcome
+    if isinstance(outcome, InfraFailure):
+        return replace(result, outcome=replace(outcome, message=outcome.message[:SENTENCE]))
+    if len(outcome.wire) <= RESULT_TEXT // 2:
+        return result  # too few bytes to break a bound, which saves a conversion
+    try:
+        check_result(lease_result_to_proto(result))
+    except ConvertError as error:
+        text = f"the result can't be sent: {error}"
+        failure = InfraFailure(InfraCode.SLOT_CRASHED, text[:SENTENCE], outcome.worker_id)
+        logger.warning("result too large lease=%s: %s", result.ref.lease_id, error)
+        return replace(result, outcome=failure)
+    return result
 
 
 async def fetch(session_now: Callable[[], ManagerSession | None], digest: str) -> bytes:

@@ -3,12 +3,16 @@
 import logging
 from typing import Final
 
+from embomatrix.rpc.wire.bounds import HELD_LEASES
 from embomatrix.rpc.wire.leases import LeaseClaim, LeaseRef, LeaseResult
+from embomatrix.rpc.wire.values import Completed
 
 logger = logging.getLogger(__name__)
 
-LIMIT: Final = 10_000
-"""Most results kept: more mean that no manager has listened for very long."""
+LIMIT: Final = HELD_LEASES
+"""Most results kept: a manager accepts claims to this many, besides those to running leases."""
+MESSAGE_BYTES: Final = 2 * 1024 * 1024
+"""Bytes of the results in one message, half of the bound on the message."""
 
 
 class ResultOutbox:
@@ -45,9 +49,19 @@ class ResultOutbox:
         )
 
     def take_unsent(self, count: int) -> tuple[LeaseResult, ...]:
-        """Take up to ``count`` results that this stream has not sent yet."""
-        refs = list(self._unsent)[:count]
-        return tuple(self._unsent.pop(ref) for ref in refs)
+        """Take up to ``count`` results that this stream has not sent yet, as far as they fit into one message."""
+        taken: list[LeaseResult] = []
+        size = 0
+        for result in list(self._unsent.values())[:count]:
+            size += _size(result)
+            if taken and size > MESSAGE_BYTES:
+                break
+            taken.append(self._unsent.pop(result.ref))
+        return tuple(taken)
+
+    def unsent(self) -> tuple[LeaseRef, ...]:
+        """Leases whose results this stream has not sent yet: for the manager they still run."""
+        return tuple(self._unsent)
 
     @property
     def has_unsent(self) -> bool:
@@ -56,3 +70,9 @@ class ResultOutbox:
     def begin_stream(self) -> None:
         """Mark all results as unsent for a new stream."""
         self._unsent = dict(self._results)
+
+
+def _size(result: LeaseResult) -> int:
+    """Return about the bytes of the result on the wire."""
+    outcome = result.outcome
+    return 256 + len(outcome.wire if isinstance(outcome, Completed) else outcome.message)

@@ -17,7 +17,7 @@ from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.status import ClusterError, DeadlineError, NotFoundError, UnavailableError, cluster_errors
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 from embomatrix.rpc.wire.codec import each
-from embomatrix.rpc.wire.leases import LeaseClaim, LeaseResult, WorkerState
+from embomatrix.rpc.wire.leases import LeaseClaim, LeaseRef, WorkerState
 from embomatrix.rpc.wire.session import (
     lease_from_proto,
     lease_progress_to_proto,
@@ -222,11 +222,14 @@ class ManagerSession:
             raise UnavailableError(f"the manager at {self._address} ended the session")
 
     async def _requests(self) -> AsyncGenerator[pb.SessionRequest]:
-        """Yield the full state first, then results as they come, and the state after each change."""
+        """Yield the full state first, then results as they come, and the state after each change.
+
+        Kept results follow the first state, since all of them may not fit into its message.
+        """
         self._outbox.begin_stream()
-        finished = self._outbox.take_unsent(len(self._outbox))
-        claims = (*self._pool.claims(), *self._outbox.claims())
-        yield self._request(self._state(finished, claims))
+        yield self._request(self._state((*self._pool.claims(), *self._outbox.claims())))
+        if self._outbox.has_unsent:
+            self._due.set()
         while not self._drained() and not self._resync_due:
             await self._due.wait()
             self._due.clear()
@@ -246,11 +249,18 @@ class ManagerSession:
             self._lingering.cancel()
             self._lingering = None
 
-    def _state(
-        self, finished: tuple[LeaseResult, ...] = (), claims: tuple[LeaseClaim, ...] = ()
-    ) -> WorkerState:
-        residents, held = self._pool.residents(), self._pool.held()
-        return WorkerState(residents, held, finished, self._draining, self._paused, claims)
+    def _state(self, claims: tuple[LeaseClaim, ...] = ()) -> WorkerState:
+        return WorkerState(
+            self._pool.residents(),
+            self._unfinished(),
+            draining=self._draining,
+            paused=self._paused,
+            claims=claims,
+        )
+
+    def _unfinished(self) -> tuple[LeaseRef, ...]:
+        """Leases whose results the manager does not have."""
+        return (*self._pool.held(), *self._outbox.unsent())
 
     def _request(self, state: WorkerState | None) -> pb.SessionRequest:
         return pb.SessionRequest(
@@ -293,7 +303,7 @@ class ManagerSession:
             request = pb.HeartbeatRequest(
                 session_id=self._registration.session_id,
                 session_epoch=self._registration.epoch,
-                running=[lease_ref_to_proto(ref) for ref in self._pool.held()],
+                running=[lease_ref_to_proto(ref) for ref in self._unfinished()],
                 load=self._pool.load,
                 memory_used_mb=int(self._pool.memory_used_mb),
                 progress=[lease_progress_to_proto(progress) for progress in self._pool.progress()],

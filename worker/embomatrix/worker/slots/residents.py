@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.rpc.wire.bounds import SENTENCE
 from embomatrix.rpc.wire.values import InfraCode, Resident, ResidentState
 from embomatrix.sim.zygote import PipeMessage
 from embomatrix.worker.slots.processes import (
@@ -148,7 +149,7 @@ class Residents:
 
     def report(self) -> tuple[Resident, ...]:
         return tuple(
-            Resident(scene.digest, scene.state, scene.load_s, scene.memory_mb, scene.error)
+            Resident(scene.digest, scene.state, scene.load_s, scene.memory_mb, scene.error[:SENTENCE])
             for scene in self._scenes.values()
         )
 
