@@ -11,6 +11,7 @@ from embomatrix.reward.hierarchy import score
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.evaluate import evaluate
+from embomatrix.world.goal import And, Atom
 from embomatrix.world.task import Task, TaskCategory
 
 PAGE = (Path(__file__).parents[3] / "docs" / "rewards.md").read_text(encoding="utf-8")
@@ -69,3 +70,21 @@ def test_example_settings_file_is_valid():
     table = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     assert table
     assert RewardSettings(**tomllib.loads(table[1])["reward"]).goal == 10.0
+
+
+@pytest.mark.parametrize("atoms", [3, 7, 9])
+def test_lines_of_the_page_give_the_reward_to_the_bit(atoms: int):
+    text = re.search(r"^```\n(format .*?)```", PAGE, re.MULTILINE | re.DOTALL)
+    assert text
+    names = tuple(f"apple_{index}" for index in range(atoms))
+    goal = And(tuple(Atom("hot", (name,)) for name in names))
+    task = Task("t", "s", "", TaskCategory.COMPOUND, goal, "", names)
+    settings = RewardSettings(format=0.3, relevance_per_object=0.1, relevance_limit=0.7, goal=30.0)
+    for count in range(atoms + 1):
+        some = names[:count]
+        found = score(task, frozenset(some), Holding([f"hot {name}" for name in some]), settings)
+        known = {"settings": settings, "touched": count, "held": count, "atoms": atoms}
+        exec(text[1], known)  # the page's own lines
+        assert (found.format, found.relevance, found.goal, found.total) == tuple(
+            known[name] for name in ("format", "relevance", "goal", "total")
+        )

@@ -19,6 +19,7 @@ from google.protobuf.message import DecodeError, Message
 
 from embomatrix.rpc.wire.codec import ConvertError, MessageT
 from embomatrix.skills.syntax import MAX_ROOM_NAME, MAX_STEPS
+from embomatrix.world.task import MAX_ATOMS
 
 LARGEST_EPOCH: Final = 2.0**63
 NAME: Final = 256
@@ -128,7 +129,7 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "Reward.format": _REWARD,
     "Reward.relevance": _REWARD,
     "Reward.goal": _REWARD,
-    "Reward.atoms": Bound(count=1_024),
+    "Reward.atoms": Bound(count=MAX_ATOMS),
     "AtomResult.text": _RESULT_TEXT,
     "StepResult.failure": _RESULT_TEXT,
     "StepResult.message": _RESULT_TEXT,
@@ -372,14 +373,16 @@ def _number_rule(field: str, bound: Bound) -> Any:
     return rule
 
 
+def _most_bytes(message: str) -> str:
+    """Return the limit of a request. Messages within it have none of their own."""
+    return f"{MESSAGE_BYTES.get(message, OTHER_BYTES):,}" if message.endswith("Request") else "–"
+
+
 def bounds_table() -> str:
     """Return the Markdown table of all bounds for ``docs/protocol.md``."""
     messages: dict[str, list[str]] = {}
     for name, bound in BOUNDS.items():
         message, _, field = name.partition(".")
         messages.setdefault(message, []).append(f"`{field}` {bound}")
-    rows = [
-        f"| `{name}` | {MESSAGE_BYTES.get(name, OTHER_BYTES):,} | {'; '.join(fields)} |"
-        for name, fields in messages.items()
-    ]
+    rows = [f"| `{name}` | {_most_bytes(name)} | {'; '.join(fields)} |" for name, fields in messages.items()]
     return "\n".join(("| message | bytes | fields |", "| --- | ---: | --- |", *rows))
