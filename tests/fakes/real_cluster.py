@@ -89,9 +89,9 @@ class RealCluster:
         cache = f"--cache-dir={self.folder / name}"
         self._start(name, "-m", "embomatrix.cli", "worker", "run", *arguments, cache)
 
-    def start_program(self, name, *command):
-        """Start a worker in another language for the first manager; appends address and name to the command."""
-        self._run(name, *map(str, command), self.address, name)
+    def start_program(self, name, *command, **environment):
+        """Start a worker in another language in the cluster's folder; appends addresses and name to the command."""
+        self._run(name, *map(str, command), self.address, name, cwd=self.folder, **environment)
 
     def start_trainer(self, name, batch, task, out):
         """Start a trainer that submits or resumes the batch and writes each result to the file ``out``."""
@@ -129,12 +129,14 @@ class RealCluster:
     def _start(self, name, *arguments):
         self._run(name, sys.executable, *arguments)
 
-    def _run(self, name, *command):
+    def _run(self, name, *command, cwd=None, **environment):
         root = str(Path(__file__).parents[2])
         paths = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), root)))
-        environment = {**os.environ, "FAKE_EXECUTIONS": str(self.executions), "PYTHONPATH": paths}
+        known = {"FAKE_EXECUTIONS": str(self.executions), "PYTHONPATH": paths, **environment}
         with (self.folder / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+            self.processes[name] = subprocess.Popen(
+                command, stdout=log, stderr=log, env={**os.environ, **known}, cwd=cwd
+            )
 
 
 async def connected(client, *names, limit_s=60.0):
