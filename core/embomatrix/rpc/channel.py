@@ -20,6 +20,10 @@ _ADDRESS: Final = re.compile(r"(?:\[[0-9A-Fa-f:.%\w]+\]|[^\s:/\[\]]+):(\d{1,5})"
 
 KEEPALIVE_TIME_MS: Final = 30_000
 KEEPALIVE_TIMEOUT_MS: Final = 10_000
+HANDSHAKE_MS: Final = 10_000
+"""Time limit for the first bytes of a connection."""
+IDLE_MS: Final = 300_000
+"""A connection without a call is closed after this time. Clients connect again with their next call."""
 MIN_PING_INTERVAL_MS: Final = 10_000
 """A server disconnects clients that ping more often."""
 
@@ -45,6 +49,9 @@ SERVER_OPTIONS: Final[tuple[tuple[str, int], ...]] = (
     ("grpc.http2.min_recv_ping_interval_without_data_ms", MIN_PING_INTERVAL_MS),
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
     ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+    # Silent connections are closed, before the first call and between calls.
+    ("grpc.server_handshake_timeout_ms", HANDSHAKE_MS),
+    ("grpc.max_connection_idle_ms", IDLE_MS),
     # A second manager on the same port must fail to bind; with SO_REUSEPORT the two would share the calls.
     ("grpc.so_reuseport", 0),
 )

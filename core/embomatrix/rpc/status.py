@@ -132,14 +132,24 @@ _TLS_TROUBLES: Final[Mapping[str, str]] = {
 
 @contextlib.asynccontextmanager
 async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
-    """Turn errors of a servicer's body into gRPC status codes. Unexpected errors are logged and become ``INTERNAL``."""
+    """Turn errors of a servicer's body into gRPC status codes. Unexpected errors are logged and become ``INTERNAL``.
+
+    The body ends there, without a value. ``context.abort`` is not used: its error and gRPC's state refer to each other, so
+    the request would stay in memory until a garbage collection.
+    """
     try:
         yield
     except grpc.aio.AbortError:
         raise
     except Exception as error:  # noqa: BLE001  # logged unless it is known
-        known = _known(error)
-        await context.abort(_status_of(known), str(known), trailing_metadata=_metadata(known))
+        refuse(context, _known(error))
+
+
+def refuse(context: grpc.aio.ServicerContext, error: ClusterError) -> None:
+    """Answer a call with the status of the error, once its servicer returns."""
+    context.set_trailing_metadata(_metadata(error))
+    context.set_code(_status_of(error))
+    context.set_details(str(error))
 
 
 def translated(servicer: type[ServicerT]) -> type[ServicerT]:

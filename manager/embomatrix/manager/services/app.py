@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import dataclasses
 import gc
 import logging
@@ -54,6 +55,9 @@ logger = logging.getLogger(__name__)
 STOP_GRACE_S: Final = 0.5
 """Calls may finish during this time; workers and trainers then attach to the next manager."""
 MEGABYTE: Final = 1_000_000
+M_MMAP_THRESHOLD: Final = -3
+"""Option of ``mallopt``."""
+LARGE_BLOCK_BYTES: Final = 256 * 1024
 YOUNG_OBJECTS: Final = 5_000
 """Objects allocated between two collections of the youngest generation, which take 2 ms."""
 LimitsT = TypeVar("LimitsT", DispatchLimits, ScheduleLimits, LivenessLimits)
@@ -78,6 +82,7 @@ async def serve(
     ``on_standby`` receives the leader's address while another manager leads.
     """
     allow_files()
+    _return_large_blocks()
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -154,6 +159,16 @@ def _collect_rarely() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(YOUNG_OBJECTS)
+
+
+def _return_large_blocks() -> None:
+    """Have the C library return large blocks of memory to the system when they are freed. GNU C library only.
+
+    Messages have up to 32 MiB. By default the library keeps freed blocks of that size, by the hundred megabytes.
+    """
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        set_option(M_MMAP_THRESHOLD, LARGE_BLOCK_BYTES)
 
 
 def _page_url(host: str, port: int, tls: Tls | None) -> str:

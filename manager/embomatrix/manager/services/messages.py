@@ -41,14 +41,12 @@ def _bounded(handler: grpc.RpcMethodHandler, request_type: type[Message]) -> grp
 
     async def unary_unary(data: bytes, context: grpc.aio.ServicerContext) -> Any:
         async with translate(context):
-            request = parsed(request_type, data)
-        return await handler.unary_unary(request, context)
+            return await handler.unary_unary(parsed(request_type, data), context)
 
     async def unary_stream(data: bytes, context: grpc.aio.ServicerContext) -> AsyncIterator[Any]:
         async with translate(context):
-            request = parsed(request_type, data)
-        async for answer in handler.unary_stream(request, context):
-            yield answer
+            async for answer in handler.unary_stream(parsed(request_type, data), context):
+                yield answer
 
     async def stream_unary(requests: AsyncIterator[bytes], context: grpc.aio.ServicerContext) -> Any:
         return await handler.stream_unary(_each_parsed(request_type, requests), context)

@@ -87,4 +87,4 @@ class RoleInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc
         method = handler_call_details.method
         headers = [value for key, value in handler_call_details.invocation_metadata or () if key == TOKEN_KEY]
         refusal = self._gate.refusal(method, headers)
-        return handler if refusal is None else refusing(method, refusal)
+        return handler if refusal is None else refusing(refusal)

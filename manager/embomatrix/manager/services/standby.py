@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import grpc
 from fastapi import FastAPI
-from google.protobuf import descriptor_pool
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from embomatrix.manager.services.listen import bind_server
 from embomatrix.rpc.channel import SERVER_OPTIONS
-from embomatrix.rpc.status import ClusterError, StandbyError, translate
+from embomatrix.rpc.status import ClusterError, StandbyError, refuse
 
 if TYPE_CHECKING:
     from embomatrix.manager.access.protection import Tls
@@ -61,32 +60,13 @@ class _Refusal(grpc.GenericRpcHandler):  # type: ignore[misc]  # grpc is untyped
         if handler_call_details.method.startswith("/grpc.health."):
             return None
         refusal = StandbyError(self._standby.sentence, self._standby.leader)
-        return refusing(handler_call_details.method, refusal)
+        return refusing(refusal)
 
 
-def refusing(method: str, refusal: ClusterError) -> grpc.RpcMethodHandler:
-    """Return a handler of the method's own kind that refuses every call.
+def refusing(refusal: ClusterError) -> grpc.RpcMethodHandler:
+    """Return a handler that refuses every call without receiving its message."""
 
-    gRPC delivers errors of unary methods only through unary handlers. The handler does not parse requests.
-    """
+    async def answer(_: Any, context: grpc.aio.ServicerContext) -> None:
+        refuse(context, refusal)
 
-    async def refuse(_: Any, context: grpc.aio.ServicerContext) -> None:
-        async with translate(context):
-            raise refusal
-
-    makers = {
-        (False, False): grpc.unary_unary_rpc_method_handler,
-        (False, True): grpc.unary_stream_rpc_method_handler,
-        (True, False): grpc.stream_unary_rpc_method_handler,
-        (True, True): grpc.stream_stream_rpc_method_handler,
-    }
-    return makers[_streams(method)](refuse)
-
-
-def _streams(method: str) -> tuple[bool, bool]:
-    """Return whether requests and answers of the method are streams; both for unknown methods."""
-    try:
-        found = descriptor_pool.Default().FindMethodByName(method.lstrip("/").replace("/", "."))
-    except KeyError:
-        return True, True
-    return found.client_streaming, found.server_streaming
+    return grpc.stream_stream_rpc_method_handler(answer)

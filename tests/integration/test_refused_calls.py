@@ -1,0 +1,60 @@
+"""A refused call leaves nothing in the manager's memory, whatever its size, and silent connections end."""
+
+import asyncio
+import contextlib
+
+import grpc
+import psutil
+import pytest
+from tests.fakes.real_cluster import RealCluster, connected
+
+from embomatrix.rpc.channel import CHANNEL_OPTIONS, SERVER_OPTIONS
+
+SECRET = "operators-secret"
+CALLS = 20
+MEGABYTES = 24
+"""Of each message. Kept until a garbage collection, twenty of them take 480 MB."""
+MOST_MB = 200.0
+
+
+@pytest.mark.parametrize("token", ["", SECRET])
+@pytest.mark.parametrize("method", ["RolloutService/Execute", "WorkerService/Register"])
+async def test_large_messages_of_refused_calls_are_freed(tmp_path, token, method):
+    with RealCluster(tmp_path, token=SECRET) as cluster:
+        cluster.start_manager()
+        async with cluster.client(token=SECRET) as client:
+            await connected(client)
+        process = psutil.Process(cluster.processes["manager"].pid)
+        first = most = process.memory_info().rss
+        metadata = (("authorization", f"Bearer {token}"),) if token else ()
+        async with grpc.aio.insecure_channel(cluster.address, options=CHANNEL_OPTIONS) as channel:
+            call = channel.unary_unary(f"/embomatrix.proto.v1.{method}")
+            for _ in range(CALLS):
+                with pytest.raises(grpc.aio.AioRpcError) as caught:
+                    await call(b"x" * (MEGABYTES * 10**6), metadata=metadata)
+                assert caught.value.code() in (
+                    grpc.StatusCode.UNAUTHENTICATED,
+                    grpc.StatusCode.INVALID_ARGUMENT,
+                )
+                most = max(most, process.memory_info().rss)
+    assert (most - first) / 1e6 < MOST_MB
+
+
+async def test_connection_that_never_speaks_is_closed():
+    hasty = [
+        (key, 500 if key == "grpc.server_handshake_timeout_ms" else value) for key, value in SERVER_OPTIONS
+    ]
+    server = grpc.aio.server(options=hasty)
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(8)]
+    try:
+        async with asyncio.timeout(10):
+            for reader, _ in silent:
+                with contextlib.suppress(ConnectionError):
+                    while await reader.read(1024):
+                        pass
+    finally:
+        for _, writer in silent:
+            writer.close()
+        await server.stop(None)
