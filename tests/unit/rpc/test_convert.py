@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -356,3 +357,33 @@ def test_checked_result_equals_the_parsed_one(completed):
 def test_worker_without_slots_is_refused():
     with pytest.raises(ConvertError, match="slots: found 0"):
         convert_session.resources_from_proto(types_pb2.Resources(cores=4))
+
+
+def padded(number: int) -> bytes:
+    """A field that this version does not know, of 30 kB."""
+    text = f"{number:030000d}".encode()
+    return bytes.fromhex("fa07") + varint(len(text)) + text
+
+
+def varint(number: int) -> bytes:
+    low = bytes([number & 0x7F])
+    return low if number < 0x80 else bytes([number & 0x7F | 0x80]) + varint(number >> 7)
+
+
+def test_large_calls_and_steps_stay_in_no_cache():
+    """Caches keep 65,536 of each: with unknown fields of 30 kB that would be four gigabytes."""
+    tracemalloc.start()
+    try:
+        for number in range(200):
+            call = types_pb2.SkillCall.FromString(MOVE.SerializeToString() + padded(number))
+            rollout = types_pb2.Rollout(
+                rollout_id="r", group_id="g", bundle_digest="d", task_id="t", plan=[call]
+            )
+            assert convert.rollout_from_proto(rollout).plan == (convert.skill_call_from_proto(MOVE),)
+            step = types_pb2.StepResult(call=call, message="done")
+            completed = types_pb2.Completed(reward=types_pb2.Reward(format=0.5), steps=[step])
+            assert convert_outcome.completed_from_proto(completed).steps[0].message == "done"
+        kept_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept_bytes < 1e6

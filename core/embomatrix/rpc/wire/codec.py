@@ -6,6 +6,7 @@ A malformed message raises ConvertError, which names the field by its full path.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from enum import Enum
@@ -23,6 +24,8 @@ MessageT = TypeVar("MessageT", bound="Message")
 EnumT = TypeVar("EnumT", bound=Enum)
 NumberT = TypeVar("NumberT", bound=int)
 
+KNOWN_BYTES: Final = 320
+"""Largest message that a cache keeps. A sender chooses its size, by unknown fields too."""
 _FLOATS: Final = (FieldDescriptor.CPPTYPE_DOUBLE, FieldDescriptor.CPPTYPE_FLOAT)
 
 
@@ -52,12 +55,23 @@ def each(
     return tuple(values)
 
 
-def each_known(field: str, known: Callable[[bytes], ValueT], messages: Sequence[bytes]) -> tuple[ValueT, ...]:
+def each_known(
+    field: str, known: functools._lru_cache_wrapper[ValueT], messages: Sequence[bytes]
+) -> tuple[ValueT, ...]:
     """Convert serialized messages through a cache. Without an error, no Python frame runs per cached message."""
+    convert: Callable[[bytes], ValueT] = known
+    if max(map(len, messages), default=0) > KNOWN_BYTES:
+        convert = functools.partial(through, known)
     try:
-        return tuple(map(known, messages))
+        return tuple(map(convert, messages))
     except ConvertError:
-        return each(field, known, messages)
+        return each(field, convert, messages)
+
+
+def through(known: functools._lru_cache_wrapper[ValueT], message: bytes) -> ValueT:
+    """Convert a serialized message through a cache, unless it is too large to be kept."""
+    value: ValueT = known(message) if len(message) <= KNOWN_BYTES else known.__wrapped__(message)
+    return value
 
 
 def inside(field: str, convert: Callable[[WireT], ValueT], message: WireT) -> ValueT:

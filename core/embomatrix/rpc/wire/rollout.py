@@ -6,7 +6,16 @@ from typing import Final, Literal
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.wire.bounds import check
-from embomatrix.rpc.wire.codec import ConvertError, each, each_known, enum_numbers, finite, maker, required
+from embomatrix.rpc.wire.codec import (
+    ConvertError,
+    each,
+    each_known,
+    enum_numbers,
+    finite,
+    maker,
+    required,
+    through,
+)
 from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.skills.syntax import (
     MAX_PLAN_BYTES,
@@ -48,7 +57,7 @@ def skill_call_to_proto(call: SkillCall) -> types_pb2.SkillCall:
 
 def skill_call_from_proto(message: types_pb2.SkillCall) -> SkillCall:
     """Return the call. Raise ConvertError unless it has exactly the arguments of its skill."""
-    return _call_of(message.SerializeToString())
+    return through(_call_of, message.SerializeToString())
 
 
 @functools.lru_cache(KNOWN)
