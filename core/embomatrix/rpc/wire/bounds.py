@@ -174,7 +174,7 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "RewardSettings.goal": _COEFFICIENT,
     "AnnounceLookaheadRequest.run_id": _ID,
     "AnnounceLookaheadRequest.version": _EPOCH,
-    "AnnounceLookaheadRequest.entries": Bound(count=65_536),
+    "AnnounceLookaheadRequest.entries": Bound(count=8_192),
     "LookaheadEntry.step": _EPOCH,
     "LookaheadEntry.bundle_digest": _ID,
     "LookaheadEntry.count": _numbers(1e9),

@@ -138,6 +138,11 @@ class Auditor:
         changed, self._changed = self._changed, {}
         return list(changed)
 
+    def forget_blank(self, worker_id: str) -> None:
+        """Drop the reputation of a worker that left before it had one: names cost a worker nothing."""
+        if self._reputations.get(worker_id) == Reputation():
+            del self._reputations[worker_id]
+
     def of(self, worker_id: str) -> Reputation:
         return self._reputations.setdefault(worker_id, Reputation())
 

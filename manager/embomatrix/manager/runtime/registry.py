@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Final
 
 from embomatrix.manager.control.events import DrainChanged, Event, SuspicionChanged, WorkerJoined, WorkerLost
-from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
+from embomatrix.rpc.status import NotFoundError, OverloadedError, SupersededError, UnknownSessionError
 from embomatrix.rpc.wire.values import Resources
 
 LISTED: Final = 10
@@ -51,6 +51,10 @@ class LivenessLimits:
     """Time in which a worker may reconnect after its stream broke."""
     remember_lost_s: float = 300.0
     """Time that a lost worker stays in the lists."""
+    most_workers: int = 20_000
+    """Workers that may be present. Further ones are refused."""
+    most_lost: int = 1_000
+    """Lost workers in the lists; of more, the first are forgotten."""
 
 
 @dataclass(slots=True, eq=False)
@@ -127,10 +131,14 @@ class Registry:
         now_s: float,
     ) -> tuple[WorkerSession, list[Event]]:
         """Open a session and end an older one of the same worker. Leases survive only if the worker's process is the
-        same.
+        same. Raises OverloadedError.
         """
         before = self._sessions.get(worker_id)
         alive = before is not None and not before.standing.is_gone
+        if not alive and len(self._by_silence) >= self._limits.most_workers:
+            raise OverloadedError(
+                f"{len(self._by_silence)} workers are connected: this manager serves no more; start another manager"
+            )
         self._epoch += 1
         session = WorkerSession(
             worker_id=worker_id,
@@ -281,7 +289,8 @@ class Registry:
     def _forget_lost(self, now_s: float) -> None:
         while self._lost:
             session = next(iter(self._lost.values()))
-            if now_s - session.last_seen_s <= self._limits.remember_lost_s:
+            recent = now_s - session.last_seen_s <= self._limits.remember_lost_s
+            if recent and len(self._lost) <= self._limits.most_lost:
                 return
             del self._lost[session.worker_id], self._sessions[session.worker_id]
             self._worker_of.pop(session.session_id, None)

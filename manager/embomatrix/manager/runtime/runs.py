@@ -70,7 +70,12 @@ BATCH_ROLLOUTS: Final = 65_536
 QUEUED_ROLLOUTS: Final = 262_144
 """Rollouts of all batches together at most."""
 RUNS: Final = 1024
-LOOKAHEAD_ENTRIES: Final = 65_536
+QUEUED_SCENES: Final = 8_192
+"""Scenes of queued rollouts at most. All are compared whenever scenes are placed."""
+LOOKAHEAD_ENTRIES: Final = 8_192
+"""Entries of one run's look-ahead window at most."""
+ALL_LOOKAHEAD_ENTRIES: Final = 16_384
+"""Entries of all windows together at most."""
 IDLE_S: Final = 6 * 3600.0
 """A run without pending rollouts is closed after this time without a call."""
 PAGE: Final = 4096
@@ -174,6 +179,13 @@ class Runs:
             raise InvalidRequestError(
                 f"{len(entries)} look-ahead entries: at most {LOOKAHEAD_ENTRIES}, announce fewer steps"
             )
+        windows = self._cluster.scheduler.windows.items()
+        others = sum(len(window.entries) for other, window in windows if other != run_id)
+        if others + len(entries) > ALL_LOOKAHEAD_ENTRIES:
+            raise OverloadedError(
+                f"other runs announced {others} look-ahead entries: at most {ALL_LOOKAHEAD_ENTRIES} fit with these "
+                f"{len(entries)}, announce fewer steps"
+            )
         self._feed(LookaheadAnnounced(run_id, version, entries))
         scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
         readiness = self._cluster.scheduler.readiness
@@ -267,6 +279,12 @@ class Runs:
         if queued + count > QUEUED_ROLLOUTS:
             raise OverloadedError(
                 f"{queued} rollouts are queued already: submit again after some have finished"
+            )
+        scenes = len({rollout.bundle_digest for rollout in batch.rollouts})
+        if scenes + self._cluster.dispatcher.waiting_scenes > QUEUED_SCENES:
+            raise OverloadedError(
+                f"batch {batch.batch_id!r} has {scenes} scenes beside {self._cluster.dispatcher.waiting_scenes} that wait: "
+                f"at most {QUEUED_SCENES} may; submit fewer at once"
             )
         missing = self._bundles.missing([rollout.bundle_digest for rollout in batch.rollouts])
         if missing:

@@ -59,6 +59,7 @@ def worker_lost(state: DispatchState, event: WorkerLost) -> None:
         return
     leases = list(worker.held.values())
     state.pool.leave(worker.worker_id)
+    state.auditor.forget_blank(worker.worker_id)
     failure = InfraFailure(InfraCode.WORKER_LOST, f"worker lost: {event.reason}", worker.worker_id)
     for lease in leases:
         give_back(state, lease, failure, counted=lease.started_s is not None)

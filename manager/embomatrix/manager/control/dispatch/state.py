@@ -1,6 +1,6 @@
 """State of the dispatcher: its one owner, with its invariants and the recent history of every rollout."""
 
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -19,6 +19,10 @@ from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
 HISTORY_KEPT: Final = 32_768
 """Steps of all rollouts that ``explain`` can look back on, at about 150 bytes each."""
+REASON_CHARS: Final = 200
+"""Characters of a reason in the history. A worker's own words may have thousands."""
+SCENES_KEPT: Final = 1_024
+"""Scenes whose failures to load are remembered. Workers name them, and each is examined at every tick."""
 WITNESSES: Final = 2
 """Workers that must fail to load a scene before the scene itself is to blame."""
 LOAD_FAILURE_MEMORY_S: Final = 60.0
@@ -87,15 +91,18 @@ class _LoadFailure:
 
 
 class LoadFailures:
-    """Failures to load, by scene and worker."""
+    """Failures to load, by scene and worker: of the ``SCENES_KEPT`` scenes that failed last."""
 
     def __init__(self) -> None:
-        self._by_scene: dict[str, dict[str, _LoadFailure]] = {}
+        self._by_scene: OrderedDict[str, dict[str, _LoadFailure]] = OrderedDict()
 
     def record(self, scene: str, worker_id: str, error: str, now_s: float) -> None:
         failures = self._by_scene.setdefault(scene, {})
         known = failures.get(worker_id)
         failures[worker_id] = _LoadFailure(known.first_s if known else now_s, now_s, error)
+        self._by_scene.move_to_end(scene)
+        if len(self._by_scene) > SCENES_KEPT:
+            self._by_scene.popitem(last=False)
 
     def forget(self, scene: str) -> None:
         self._by_scene.pop(scene, None)
@@ -197,7 +204,7 @@ class DispatchState:
 
     def log(self, kind: RolloutStepKind, key: RolloutKey, worker_id: str = "", reason: str = "") -> None:
         """Add a step to the history of a rollout, or of all rollouts of a batch for an empty rollout id."""
-        self._history.append((self.now_s, kind, key, worker_id, reason, type(self.cause)))
+        self._history.append((self.now_s, kind, key, worker_id, reason[:REASON_CHARS], type(self.cause)))
 
     def explain(self, rollout_id: str) -> list[RolloutStep]:
         """Return the history of a rollout in order, as far as it is kept. Costs a scan of the whole history."""

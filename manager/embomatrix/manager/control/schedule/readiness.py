@@ -1,5 +1,6 @@
 """Readiness forecast for trainers and operators: when each scene will be warm, or why it will not."""
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Final
 
@@ -7,6 +8,8 @@ from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
 from embomatrix.manager.control.schedule.residency import Residencies, WorkerResidency
 from embomatrix.rpc.wire.values import LookaheadAnswer, PlanCell, Resident, ResidentState, Warmth
 
+SCENES_KEPT: Final = 16_384
+"""Scenes whose costs are remembered: those that workers reported last."""
 LEARNING: Final = 0.05
 """Weight of the latest measurement in moving averages."""
 
@@ -16,8 +19,8 @@ class SceneCosts:
 
     def __init__(self, guess_mb: float) -> None:
         self._guess_mb = guess_mb
-        self.measured_mb: dict[str, float] = {}
-        self.load_s: dict[str, float] = {}
+        self.measured_mb: OrderedDict[str, float] = OrderedDict()
+        self.load_s: OrderedDict[str, float] = OrderedDict()
         self.typical_load_s = 0.0
         self.execute_s = 0.0
         """Execution time on a slot of speed 1."""
@@ -37,6 +40,11 @@ class SceneCosts:
             before_s = self.load_s.get(scene, resident.load_s)
             self.load_s[scene] = 0.5 * (before_s + resident.load_s)
             self.typical_load_s = _averaged(self.typical_load_s, resident.load_s)
+        for costs in (self.measured_mb, self.load_s):
+            if scene in costs:
+                costs.move_to_end(scene)
+            if len(costs) > SCENES_KEPT:
+                costs.popitem(last=False)
 
     def executed(self, seconds: float) -> None:
         """Add an execution time, in seconds on a slot of speed 1."""

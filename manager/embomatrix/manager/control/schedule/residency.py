@@ -6,10 +6,14 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
+from typing import Final
 
 from embomatrix.manager.control.schedule.placement import Need, Site
 from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.values import Resident, ResidentState
+
+FAILURES_KEPT: Final = 256
+"""Failed scenes of one worker that are remembered after it stops reporting them."""
 
 
 @dataclass(slots=True, eq=False)
@@ -64,9 +68,14 @@ class WorkerResidency:
         if resident.state is ResidentState.FAILED:
             self.failed_s.setdefault(scene, now_s)
             self.failure_messages[scene] = resident.error
+            if len(self.failed_s) > FAILURES_KEPT:
+                self._forget_failure(next(iter(self.failed_s)))
             return
         since_s = self.warm_since_s if resident.state is ResidentState.WARM else self.loading_since_s
         since_s.setdefault(scene, now_s)
+        self._forget_failure(scene)
+
+    def _forget_failure(self, scene: str) -> None:
         self.failed_s.pop(scene, None)
         self.failure_messages.pop(scene, None)
 
@@ -235,6 +244,7 @@ class ResidencySites:
         sizes = ((need.bundle_digest, measured_mb.get(need.bundle_digest, 0.0)) for need in needs)
         self._large = [(scene, size) for scene, size in sizes if size > residencies.least_memory_mb]
         """Scenes with a measured size beyond the memory of some worker."""
+        self._refused: dict[str, frozenset[str]] = {}
 
     @property
     def ids(self) -> Iterable[str]:
@@ -259,12 +269,18 @@ class ResidencySites:
 
     def refused(self, residency: WorkerResidency) -> frozenset[str]:
         """Return the scenes that recently failed there, that do not fit, or that need a GPU."""
+        known = self._refused.get(residency.worker_id)
+        if known is None:
+            known = self._refused[residency.worker_id] = frozenset(self._refusals(residency))
+        return known
+
+    def _refusals(self, residency: WorkerResidency) -> set[str]:
         refused = {scene for scene, at_s in residency.failed_s.items() if self._now_s - at_s < self._retry_s}
         memory_mb = residency.worker.resources.memory_mb
         refused.update(scene for scene, size in self._large if size > memory_mb)
         if self._rendering and not residency.renders:
             refused.update(self._rendering)
-        return frozenset(refused)
+        return refused
 
     def having(self, scene: str) -> Iterable[str]:
         return [residency.worker_id for residency in self._residencies.having(scene)]

@@ -5,7 +5,7 @@ the reports of workers. Its output is one desired set per worker, sent again onl
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -37,6 +37,8 @@ from embomatrix.rpc.wire.values import Batch, Completed, Resident, RunTerms
 DEFAULT_TERMS: Final = RunTerms()
 OVERDUE: Final = 3.0
 """Multiple of the usual load time after which a load is no longer waited for."""
+MOST_NEEDS: Final = 2_048
+"""Scenes placed at once: the most urgent ones. Workers hold fewer, and a placement takes time for each."""
 LEASES_AT_A_TIME: Final = 64
 """Live leases whose cost in a placement equals that of one worker."""
 
@@ -120,6 +122,10 @@ class Scheduler:
         """Place every needed scene; return the desired sets that changed."""
         self._now_s = now_s
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
+        if len(needs) > MOST_NEEDS:
+            waiting = {scene: turn for turn, scene in enumerate(self._demand.waited_s)}
+            needs.sort(key=lambda need: (need.rank, waiting.get(need.bundle_digest, MOST_NEEDS)))
+            del needs[MOST_NEEDS:]
         # The run whose turn is next owns a scene, else the first run that announced it.
         owners = {scene: run for run, window in reversed(self.windows.items()) for scene in window.scenes}
         owners |= self._demand.runs
@@ -140,9 +146,8 @@ class Scheduler:
         )
         placement = place(sites, needs, self._costs.size_mb)
         self._residencies.fresh.clear()
-        self.unplaceable = {
-            scene: self._refusal_reason(scene) for scene in placement.homeless if sites.all_refuse(scene)
-        }
+        refused = [scene for scene in placement.homeless if sites.all_refuse(scene)]
+        self.unplaceable = self._refusal_reasons(refused) if refused else {}
         self.cost = len(needs) + len(placement.desired) + len(self._demand.in_use) // LEASES_AT_A_TIME
         orders = (self._order(name, scenes) for name, scenes in placement.desired.items())
         return [order for order in orders if order is not None]
@@ -271,11 +276,16 @@ class Scheduler:
             render=need.render or scene in self._demand.rendering,
         )
 
-    def _refusal_reason(self, scene: str) -> str:
-        announced = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
-        renders = scene in announced or scene in self._demand.rendering
-        size_mb = self._costs.size_mb(scene)
-        return refusal_reason(self._residencies, scene, size_mb, renders=renders)
+    def _refusal_reasons(self, scenes: Iterable[str]) -> dict[str, str]:
+        """Return why no worker takes each of these scenes."""
+        rendering = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
+        rendering |= self._demand.rendering
+        return {
+            scene: refusal_reason(
+                self._residencies, scene, self._costs.size_mb(scene), renders=scene in rendering
+            )
+            for scene in scenes
+        }
 
     def _order(self, name: str, scenes: tuple[str, ...]) -> SetDesired | None:
         """Return the order for a worker; None if neither the set nor the order of its loads changes."""
