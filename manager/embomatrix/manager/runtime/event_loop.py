@@ -34,7 +34,7 @@ from embomatrix.manager.runtime.runs import Runs
 from embomatrix.manager.runtime.state_journal import StateJournal
 from embomatrix.manager.runtime.worker_link import WorkerCommand, WorkerLink
 from embomatrix.manager.store.opening import timed_store
-from embomatrix.manager.store.protocol import StateStore
+from embomatrix.manager.store.protocol import FencedError, StateStore
 from embomatrix.rpc.status import ClusterError, InternalError, SupersededError, UnavailableError
 from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
 from embomatrix.rpc.wire.values import Resources
@@ -114,7 +114,7 @@ class ManagerRuntime:
     async def _serve(self) -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_time())
-            group.create_task(self._clean_up())
+            group.create_task(self._keep_clean())
             group.create_task(self._journal.serve())
             group.create_task(self._delivery.serve())
             group.create_task(self.runs.serve())
@@ -329,9 +329,9 @@ class ManagerRuntime:
                     "the manager did not run for %.1f s: is its machine paused, or short of memory?", late_s
                 )
                 self.registry.excuse_silence(late_s, now_s=time.monotonic())
-            self._watch_leadership()
-            self._warn_unaudited()
             try:
+                self._watch_leadership()
+                self._warn_unaudited()
                 self._tick()
             except Exception:
                 # A tick repeats everything that a failed one left undone.
@@ -345,9 +345,14 @@ class ManagerRuntime:
             self._close_link(event.worker_id)
         self._carry_out(commands)
 
-    async def _clean_up(self) -> None:
+    async def _keep_clean(self) -> None:
         while True:
             self.load.sample(time.monotonic(), time.process_time(), self.event_log.execute_s)
             await asyncio.sleep(CLEANUP_S)
-            await self._delivery.give_up_outdated(time.monotonic())
-            await self.runs.close_idle(time.monotonic())
+            try:
+                await self._delivery.give_up_outdated(time.monotonic())
+                await self.runs.close_idle(time.monotonic())
+            except FencedError:
+                raise
+            except Exception:
+                logger.exception("cleaning up failed, the next time is in %g s", CLEANUP_S)

@@ -255,7 +255,8 @@ class Runs:
         for run_id, heard_s in list(self._heard_s.items()):
             if now_s - heard_s > IDLE_S and not self._cluster.dispatcher.pending_of(run_id):
                 logger.info("closing idle run run=%s", run_id)
-                with contextlib.suppress(UnavailableError):
+                # A trainer may have closed it during the wait for another one.
+                with contextlib.suppress(UnavailableError, NotFoundError):
                     await self.close_run(run_id)
 
     def touch(self, run_id: str) -> RunRow:
@@ -366,6 +367,11 @@ class Submissions:
                 # Other events are processed between two slices.
                 await asyncio.sleep(0)
                 run_id, batch_id, left = self._entering.popleft()
-                self._feed(BatchContinued(run_id, batch_id, PIECE))
+                try:
+                    self._feed(BatchContinued(run_id, batch_id, PIECE))
+                except Exception:
+                    # The rest of the batch ends with its deadline, and the other batches go on.
+                    logger.exception("state machine failed on batch=%s of run=%s", batch_id, run_id)
+                    continue
                 if left > PIECE:
                     self._entering.append((run_id, batch_id, left - PIECE))

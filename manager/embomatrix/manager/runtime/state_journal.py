@@ -81,9 +81,12 @@ class StateJournal:
                     async with asyncio.timeout(WRITE_S):
                         await self._urgent.wait()
                 self._urgent.clear()
-                await self._note_present()
-                await self._note_reputations()
-                await self._note_windows()
+                try:
+                    await self._note_present()
+                    await self._note_reputations()
+                    await self._note_windows()
+                except Exception:
+                    logger.exception("state not journaled, the next attempt is in %g s", WRITE_S)
         finally:
             await self._note_reputations()
             await self._note_windows()
