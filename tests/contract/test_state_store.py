@@ -386,14 +386,20 @@ async def test_redis_that_evicts_is_refused_with_the_remedy(tmp_path):
         await store.close()
 
 
-async def test_a_redis_server_that_lost_its_data_is_not_called_another_manager(tmp_path):
+@pytest.mark.parametrize("led_again", [False, True])
+async def test_a_redis_server_that_lost_its_data_is_not_called_another_manager(tmp_path, led_again):
+    """Another manager may lead the empty state already: its epoch is lower."""
     with RedisServer(tmp_path / "lost", free_port()) as server:
-        store = RedisStore(server.url)
+        store, other = RedisStore(server.url), RedisStore(server.url)
+        await store.claim(FIRST)
         await store.claim(FIRST)
         eraser = Redis.from_url(server.url)
         await eraser.flushall()
         await eraser.aclose()
+        if led_again:
+            assert (await other.claim(SECOND)).mine
         with pytest.raises(FencedError, match="Redis lost its data") as caught:
             await store.open_run(RunRow("r1", "run"))
         assert "another manager" not in str(caught.value)
         await store.close()
+        await other.close()

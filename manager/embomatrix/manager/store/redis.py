@@ -247,14 +247,7 @@ class RedisStore:
             return await answer
         except ResponseError as error:
             if _FENCED in str(error):
-                if not await self._redis.exists(self._key("epoch")):
-                    raise FencedError(
-                        f"the state in {self._shown} is gone: Redis lost its data (restarted without a file, or flushed?). "
-                        "Turn on its append-only file and restart this manager; open runs are lost"
-                    ) from error
-                raise FencedError(
-                    f"another manager took over the state in {self._shown}: stop this one"
-                ) from error
+                raise FencedError(await self._why_fenced()) from error
             # Redis 6.2 wraps the out-of-memory error of a script in another error.
             if isinstance(error, OutOfMemoryError) or _NO_MEMORY in str(error):
                 raise StateFullError(
@@ -265,6 +258,17 @@ class RedisStore:
             raise StateError(
                 f"Redis at {self._shown} can't be reached ({error}): start it, or pass another --state"
             ) from error
+
+    async def _why_fenced(self) -> str:
+        """Return why this manager leads no longer. A successor has a higher epoch, unless it found an empty state."""
+        with contextlib.suppress(RedisError, OSError):
+            found = await self._redis.get(self._key("epoch"))
+            if found is None or int(found) < self._epoch:
+                return (
+                    f"the state in {self._shown} is gone: Redis lost its data (restarted without a file, or flushed?). "
+                    "Turn on its append-only file and restart this manager; open runs are lost"
+                )
+        return f"another manager took over the state in {self._shown}: stop this one"
 
 
 def _row(cursor: int, member: bytes) -> ResultRow:
