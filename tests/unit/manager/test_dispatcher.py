@@ -5,6 +5,7 @@ from tests.fakes.dispatch import Table, crash, leases
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, FinishBatch
+from embomatrix.manager.control.dispatch.state import steps_of
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchSubmitted,
@@ -371,7 +372,7 @@ def test_history_of_a_redispatched_rollout_names_workers_reasons_and_causes(tabl
     assert state.where("b1-0").endswith(" on w1")
     (again, _) = leases(table.apply(WorkerLost("w1", "killed"), after_s=1.0))
     table.finish(again)
-    steps = state.explain("b1-0")
+    steps = steps_of("b1-0", state.history(), state.batches_with("b1-0"))
     assert [(step.kind, step.worker_id, step.cause) for step in steps] == [
         ("submitted", "", "BatchSubmitted"),
         ("leased", "w1", "BatchSubmitted"),
@@ -381,7 +382,7 @@ def test_history_of_a_redispatched_rollout_names_workers_reasons_and_causes(tabl
         ("delivered", "", "LeaseFinished"),
     ]
     assert steps[2].reason == "worker lost: killed"
-    assert (state.where("b1-0"), state.explain("b1-9")) == ("", [])
+    assert (state.where("b1-0"), steps_of("b1-9", state.history(), set())) == ("", [])
 
 
 def test_failure_names_the_worker_that_reported_it_whatever_it_says(table):

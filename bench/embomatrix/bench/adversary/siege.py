@@ -58,7 +58,7 @@ LAST_WORDS: Final = 2_000
 """Characters of the manager's log that are kept."""
 PROBATION: Final = 50
 """Default of the manager's ``audit_probation``: the unaudited results that a new worker may deliver at most."""
-LAG_BUCKET: Final = re.compile(r'embo_manager_lag_seconds_bucket\{le="([^"]+)"\} (\S+)')
+LAG: Final = re.compile(r"^embo_manager_longest_lag_seconds (\S+)", re.MULTILINE)
 ERRORS: Final = re.compile(r"^embo_errors_total (\S+)", re.MULTILINE)
 OPENER: Final = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Opens loopback addresses even where a proxy is configured."""
@@ -89,7 +89,7 @@ class Harm:
     """Honest rollouts that were delivered with the honest result."""
     rss_growth_mb: float = 0.0
     loop_stall_s: float = 0.0
-    """Longest lag of the manager's clock, to the resolution of its histogram."""
+    """Longest lag of the manager's clock."""
     internal: int = 0
     """Calls that the manager answered with INTERNAL."""
     alarms: int = 0
@@ -284,7 +284,7 @@ def _read_state(place: Field, harm: Harm) -> None:
             harm.unreadable.append(f"{path}: {error}")
     with contextlib.suppress(OSError):
         metrics = _page(place, "/metrics")
-        harm.loop_stall_s = _longest_lag_s(metrics)
+        harm.loop_stall_s = float(found[1]) if (found := LAG.search(metrics)) else 0.0
         harm.alarms = int(float(found[1])) if (found := ERRORS.search(metrics)) else 0
 
 
@@ -297,16 +297,6 @@ def _page(place: Field, path: str) -> str:
     request = urllib.request.Request(url, headers={"Authorization": f"Bearer {ADMIN}"})
     with OPENER.open(request, timeout=10) as answer:
         return str(answer.read().decode())
-
-
-def _longest_lag_s(metrics: str) -> float:
-    """Return the upper bound of the last bucket with a tick in it."""
-    before, longest_s = 0.0, 0.0
-    for bound, count in LAG_BUCKET.findall(metrics):
-        if float(count) > before:
-            longest_s = float(bound)
-        before = float(count)
-    return longest_s
 
 
 async def tempt(place: Field, rollouts: int, *, verified: bool) -> Harm:

@@ -26,9 +26,15 @@ class ManagerLoad:
     def __init__(self) -> None:
         self.lag = Histogram()
         """Lag of each tick in seconds. More than a few hundredths mean that the event loop is saturated."""
+        self.longest_lag_s = 0.0
         self.store: defaultdict[str, Histogram] = defaultdict(Histogram)
         """Durations of store operations in seconds, by name."""
         self._samples: deque[_Sample] = deque()
+
+    def lagged(self, seconds: float) -> None:
+        """Count the lag of a tick."""
+        self.lag.observe(seconds)
+        self.longest_lag_s = max(self.longest_lag_s, seconds)
 
     def operated(self, operation: str, seconds: float) -> None:
         """Count an operation of the store."""

@@ -16,6 +16,7 @@ from typing import Final
 from google.protobuf.message import DecodeError
 
 from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.dispatch.state import steps_of
 from embomatrix.manager.observe.event_log import PAGE, RunEventLog, RunRecord
 from embomatrix.manager.observe.run_figures import summary_of
 from embomatrix.proto.v1 import admin_service_pb2 as pb
@@ -98,10 +99,12 @@ class RunHistory:
         beyond = [event for event in events if event.sequence > after]
         return EventPage(tuple(beyond[:limit]), summary.events_dropped)
 
-    def explain(self, rollout_id: str) -> RolloutExplanation:
+    async def explain(self, rollout_id: str) -> RolloutExplanation:
         """Return the recent decisions about a rollout. Raises ``NotFoundError``."""
         state = self._cluster.dispatcher.state
-        steps, place = state.explain(rollout_id), state.where(rollout_id)
+        place = state.where(rollout_id)
+        # The whole history is searched, which takes longer than other calls should wait.
+        steps = await asyncio.to_thread(steps_of, rollout_id, state.history(), state.batches_with(rollout_id))
         if not steps and not place:
             raise NotFoundError(
                 f"there is no trace of rollout {rollout_id!r}: this manager never had it, or its history made room for "

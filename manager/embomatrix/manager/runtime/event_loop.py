@@ -323,7 +323,7 @@ class ManagerRuntime:
             due_s = time.monotonic() + TICK_S
             await asyncio.sleep(TICK_S)
             late_s = time.monotonic() - due_s
-            self.load.lag.observe(late_s)
+            self.load.lagged(late_s)
             if late_s >= STALLED_S:
                 logger.warning(
                     "the manager did not run for %.1f s: is its machine paused, or short of memory?", late_s

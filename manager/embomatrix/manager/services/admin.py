@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from typing import TYPE_CHECKING
 
@@ -42,12 +43,13 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
 
     async def ReadEvents(self, request: pb.ReadEventsRequest, context: Context) -> pb.ReadEventsResponse:
         page = await self._runtime.history.events(request.run_id, request.after, request.limit)
-        return event_page_to_proto(page)
+        # Thousands of events take longer than other calls should wait.
+        return await asyncio.to_thread(event_page_to_proto, page)
 
     async def ExplainRollout(
         self, request: pb.ExplainRolloutRequest, context: Context
     ) -> pb.ExplainRolloutResponse:
-        return explanation_to_proto(self._runtime.history.explain(request.rollout_id))
+        return explanation_to_proto(await self._runtime.history.explain(request.rollout_id))
 
     async def DrainWorker(self, request: pb.DrainWorkerRequest, context: Context) -> pb.DrainWorkerResponse:
         self._runtime.drain_worker(request.worker_id)

@@ -98,6 +98,8 @@ class _Cluster(Collector):
         text = "CPU time of the manager over that of the manager and the slots, in the last minute."
         yield _gauge("embo_manager_overhead_ratio", text, share)
         yield _histograms("embo_manager_lag_seconds", "Lag of the manager's clock ticks.", runtime.load.lag)
+        longest_s = runtime.load.longest_lag_s
+        yield _gauge("embo_manager_longest_lag_seconds", "Longest lag since the manager started.", longest_s)
         operations = runtime.load.store
         yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", operations, "op")
         dropped = sum(run.ring.dropped for run in runtime.event_log.runs.values())

@@ -1,7 +1,7 @@
 """State of the dispatcher: its one owner, with its invariants and the recent history of every rollout."""
 
 from collections import Counter, OrderedDict, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -132,6 +132,22 @@ class LoadFailures:
         return InfraFailure(InfraCode.SCENE_LOAD_FAILED, message, worker_id)
 
 
+HistoryEntry = tuple[float, RolloutStepKind, RolloutKey, str, str, type]
+"""Step of a rollout: time, kind, rollout, worker, reason, and the event that caused it."""
+
+
+def steps_of(
+    rollout_id: str, history: Sequence[HistoryEntry], batches: Set[tuple[str, str]]
+) -> list[RolloutStep]:
+    """Return the steps of a rollout, and those of its batch, in order. ``batches`` are its open ones."""
+    found = batches | {key[:2] for _, _, key, *_ in history if key.rollout_id == rollout_id}
+    return [
+        RolloutStep(at_s, kind, key.run_id, key.batch_id, worker_id, reason, cause.__name__)
+        for at_s, kind, key, worker_id, reason, cause in history
+        if key.rollout_id in (rollout_id, "") and key[:2] in found
+    ]
+
+
 class DispatchState:
     """All that the dispatcher knows. The modules of this package are functions ``(state, …)`` that change it.
 
@@ -183,9 +199,7 @@ class DispatchState:
         self.freed: dict[str, Event | None] = {}
         """Workers that lost a lease during this event, with the cause. Their slots are filled last."""
         self._commands: list[ManagerCommand] = []
-        self._history: deque[tuple[float, RolloutStepKind, RolloutKey, str, str, type]] = deque(
-            maxlen=HISTORY_KEPT
-        )
+        self._history: deque[HistoryEntry] = deque(maxlen=HISTORY_KEPT)
 
     def emit(self, command: ManagerCommand) -> None:
         """Add a new command to those of the event, which is its cause."""
@@ -206,15 +220,13 @@ class DispatchState:
         """Add a step to the history of a rollout, or of all rollouts of a batch for an empty rollout id."""
         self._history.append((self.now_s, kind, key, worker_id, reason[:REASON_CHARS], type(self.cause)))
 
-    def explain(self, rollout_id: str) -> list[RolloutStep]:
-        """Return the history of a rollout in order, as far as it is kept. Costs a scan of the whole history."""
-        batches = {key[:2] for _, _, key, *_ in self._history if key.rollout_id == rollout_id}
-        batches |= {(b.run_id, b.batch_id) for b in self.batches if rollout_id in b.open}
-        return [
-            RolloutStep(at_s, kind, key.run_id, key.batch_id, worker_id, reason, cause.__name__)
-            for at_s, kind, key, worker_id, reason, cause in self._history
-            if key.rollout_id in (rollout_id, "") and key[:2] in batches
-        ]
+    def history(self) -> list[HistoryEntry]:
+        """Return the recent steps of all rollouts, oldest first."""
+        return list(self._history)
+
+    def batches_with(self, rollout_id: str) -> set[tuple[str, str]]:
+        """Return run and batch id of the open batches that have this rollout without an outcome."""
+        return {(b.run_id, b.batch_id) for b in self.batches if rollout_id in b.open}
 
     def where(self, rollout_id: str) -> str:
         """Return the place of a rollout without an outcome, in words; empty if there is none."""
