@@ -70,6 +70,8 @@ class Kind:
 KINDS: Final[dict[str, Kind]] = {}
 SLOW: Final = 0.02
 """Weight of kinds whose message has megabytes."""
+LARGE_BYTES: Final = 24_000_000
+UNKNOWN_BYTES: Final = 30_000
 
 
 def hostile(name: str, actor: Actor, method: str = "", weight: float = 1.0) -> Callable[[Make], Make]:
@@ -112,3 +114,16 @@ def _enter_every_method() -> None:
 
 
 _enter_every_method()
+
+
+@hostile("24 MB without a token", Actor.STRANGER, "RolloutService/CancelBatch", SLOW)
+def _large_call(_known: Knowledge, maker: MessageMaker) -> Sequence[Payload]:
+    return [maker.rng.randbytes(LARGE_BYTES)]
+
+
+def unknown_field(maker: MessageMaker) -> bytes:
+    """Return a field of 30 kB that no version of the protocol has; messages keep it."""
+    text = maker.rng.randbytes(UNKNOWN_BYTES)
+    # Number 127, length-delimited, and the length in three groups of seven bits.
+    length = (UNKNOWN_BYTES & 0x7F | 0x80, UNKNOWN_BYTES >> 7 & 0x7F | 0x80, UNKNOWN_BYTES >> 14)
+    return bytes((0xFA, 0x07, *length)) + text

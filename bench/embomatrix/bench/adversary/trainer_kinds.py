@@ -4,7 +4,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from embomatrix.bench.adversary.kinds import SLOW, Actor, Knowledge, hostile
+from embomatrix.bench.adversary.kinds import LARGE_BYTES, SLOW, Actor, Knowledge, hostile, unknown_field
 from embomatrix.bench.adversary.messages import NUMBERS, MessageMaker
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import scene_service_pb2, types_pb2
@@ -79,6 +79,12 @@ def _weight(request: pb.OpenRunRequest, maker: MessageMaker) -> None:
     request.priority = maker.rng.choice((-(2**31), 0, 2**31 - 1))
 
 
+@_open_kind("weights far apart")
+def _weights(request: pb.OpenRunRequest, maker: MessageMaker) -> None:
+    request.run_id = f"{request.run_id}-{maker.rng.randrange(8)}"
+    request.weight = maker.rng.choice((5e-324, 1e-300, 1e-3, 1e6))
+
+
 @_open_kind("run with any coefficients")
 def _coefficients(request: pb.OpenRunRequest, maker: MessageMaker) -> None:
     request.run_id = f"{request.run_id}-{maker.rng.randrange(8)}"
@@ -120,6 +126,11 @@ def _other_skill(request: pb.ExecuteRequest, maker: MessageMaker) -> None:
 @_execute_kind("call with any arguments")
 def _any_call(request: pb.ExecuteRequest, maker: MessageMaker) -> None:
     request.rollouts[0].plan[0].CopyFrom(maker.any(types_pb2.SkillCall))
+
+
+@_execute_kind("call with 30 kB of unknown fields")
+def _padded_call(request: pb.ExecuteRequest, maker: MessageMaker) -> None:
+    request.rollouts[0].plan[0].MergeFromString(unknown_field(maker))
 
 
 @_execute_kind("turn by NaN")
@@ -168,6 +179,21 @@ def _lookahead(known: Knowledge, maker: MessageMaker) -> Sequence[pb.AnnounceLoo
     request = maker.any(pb.AnnounceLookaheadRequest)
     request.run_id = known.run_id
     return [request]
+
+
+@hostile("look-ahead of 8,000 scenes for GPUs", Actor.TRAINER, "RolloutService/AnnounceLookahead", SLOW)
+def _many_scenes(known: Knowledge, maker: MessageMaker) -> Sequence[pb.AnnounceLookaheadRequest]:
+    scenes = (f"sha256:{maker.rng.getrandbits(256):064x}" for _ in range(8_000))
+    entries = [pb.LookaheadEntry(step=1, bundle_digest=scene, count=1, render=True) for scene in scenes]
+    return [
+        pb.AnnounceLookaheadRequest(run_id=known.run_id, version=maker.rng.getrandbits(62), entries=entries)
+    ]
+
+
+@hostile("batch of 24 MB", Actor.TRAINER, EXECUTE, SLOW)
+def _large_batch(known: Knowledge, maker: MessageMaker) -> Sequence[bytes]:
+    del known
+    return [maker.rng.randbytes(LARGE_BYTES)]
 
 
 @hostile("training figures of NaN", Actor.TRAINER, "RolloutService/ReportTraining")

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from embomatrix.bench.adversary.kinds import SLOW, Actor, Knowledge, hostile
+from embomatrix.bench.adversary.kinds import SLOW, Actor, Knowledge, hostile, unknown_field
 from embomatrix.bench.adversary.messages import MessageMaker
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.proto.v1 import worker_service_pb2 as pb
@@ -167,6 +167,12 @@ def _long_final(result: pb.LeaseResult, maker: MessageMaker) -> None:
     result.completed.final_state.extend([maker.text()] * 300)
 
 
+@_result_kind("step with 30 kB of unknown fields")
+def _padded_step(result: pb.LeaseResult, maker: MessageMaker) -> None:
+    if result.completed.steps:
+        result.completed.steps[0].MergeFromString(unknown_field(maker))
+
+
 @_result_kind("infrastructure failure with any code")
 def _any_failure(result: pb.LeaseResult, maker: MessageMaker) -> None:
     result.infra_failure.code = maker.rng.choice((0, 1, 3, 99))  # type: ignore[assignment]
@@ -289,6 +295,15 @@ def _unknown_scene(known: Knowledge, maker: MessageMaker) -> pb.WorkerState:
 def _failed_scene(known: Knowledge, maker: MessageMaker) -> pb.WorkerState:
     state = _own_state(known)
     state.residents[0].state, state.residents[0].error = pb.RESIDENT_STATE_FAILED, maker.text()
+    return state
+
+
+@_state_kind("1,000 failed scenes of new names", SLOW)
+def _failed_scenes(known: Knowledge, maker: MessageMaker) -> pb.WorkerState:
+    state = _own_state(known)
+    for _ in range(1_000):
+        digest = f"sha256:{maker.rng.getrandbits(256):064x}"
+        state.residents.add(bundle_digest=digest, state=pb.RESIDENT_STATE_FAILED, error=digest * 20)
     return state
 
 
