@@ -134,18 +134,18 @@ async def runs(tmp_path):
     bundles, archive = BundleStore(tmp_path / "bundles", total_bytes=1), RunArchive(tmp_path / "runs")
     runtime = ManagerRuntime(cluster, registry, open_store("memory:"), bundles, archive)
     await runtime.start()
-    for number in range(3):
+    for number in range(5):
         await runtime.runs.open_run("run", f"r{number}")
     return runtime.runs
 
 
 async def test_windows_of_all_runs_share_one_limit(runs):
-    entries = tuple(LookaheadEntry(n, f"sha256:{n:064d}", 1) for n in range(8_192))
-    runs.announce("r0", 1, entries)
-    runs.announce("r1", 1, entries)
+    entries = tuple(LookaheadEntry(n, f"sha256:{n:064d}", 1) for n in range(4_096))
+    for number in range(4):
+        runs.announce(f"r{number}", 1, entries)
     runs.announce("r1", 2, entries)
     with pytest.raises(OverloadedError, match="other runs announced 16384"):
-        runs.announce("r2", 1, entries[:1])
+        runs.announce("r4", 1, entries[:1])
 
 
 async def test_batch_of_more_scenes_than_may_wait_is_refused(runs):

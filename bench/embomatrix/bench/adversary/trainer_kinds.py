@@ -181,9 +181,9 @@ def _lookahead(known: Knowledge, maker: MessageMaker) -> Sequence[pb.AnnounceLoo
     return [request]
 
 
-@hostile("look-ahead of 8,000 scenes for GPUs", Actor.TRAINER, "RolloutService/AnnounceLookahead", SLOW)
+@hostile("look-ahead of 4,000 scenes for GPUs", Actor.TRAINER, "RolloutService/AnnounceLookahead", SLOW)
 def _many_scenes(known: Knowledge, maker: MessageMaker) -> Sequence[pb.AnnounceLookaheadRequest]:
-    scenes = (f"sha256:{maker.rng.getrandbits(256):064x}" for _ in range(8_000))
+    scenes = (f"sha256:{maker.rng.getrandbits(256):064x}" for _ in range(4_000))
     entries = [pb.LookaheadEntry(step=1, bundle_digest=scene, count=1, render=True) for scene in scenes]
     return [
         pb.AnnounceLookaheadRequest(run_id=known.run_id, version=maker.rng.getrandbits(62), entries=entries)

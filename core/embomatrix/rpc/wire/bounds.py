@@ -174,7 +174,7 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "RewardSettings.goal": _COEFFICIENT,
     "AnnounceLookaheadRequest.run_id": _ID,
     "AnnounceLookaheadRequest.version": _EPOCH,
-    "AnnounceLookaheadRequest.entries": Bound(count=8_192),
+    "AnnounceLookaheadRequest.entries": Bound(count=4_096),
     "LookaheadEntry.step": _EPOCH,
     "LookaheadEntry.bundle_digest": _ID,
     "LookaheadEntry.count": _numbers(1e9),
@@ -236,7 +236,7 @@ MESSAGE_BYTES: Final[Mapping[str, int]] = {
     "SessionRequest": 4 * 1024 * 1024,
     "ExecuteRequest": 32 * 1024 * 1024,
     "PutBundleRequest": 5 * 1024 * 1024,
-    "AnnounceLookaheadRequest": 8 * 1024 * 1024,
+    "AnnounceLookaheadRequest": 4 * 1024 * 1024,
     "MissingBundlesRequest": 8 * 1024 * 1024,
     "ReportTrainingRequest": 4 * 1024 * 1024,
 }

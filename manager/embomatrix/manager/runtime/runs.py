@@ -72,7 +72,7 @@ QUEUED_ROLLOUTS: Final = 262_144
 RUNS: Final = 1024
 QUEUED_SCENES: Final = 8_192
 """Scenes of queued rollouts at most. All are compared whenever scenes are placed."""
-LOOKAHEAD_ENTRIES: Final = 8_192
+LOOKAHEAD_ENTRIES: Final = 4_096
 """Entries of one run's look-ahead window at most."""
 ALL_LOOKAHEAD_ENTRIES: Final = 16_384
 """Entries of all windows together at most."""
