@@ -23,6 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from embomatrix.host.failure import INTERRUPTED, fail
 from embomatrix.host.limits import usable_cores
+from embomatrix.host.printable import printable
 from embomatrix.rpc.options import Ca, Token, add_settings, given_options
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
@@ -361,7 +362,7 @@ def _judge(
     with _bar("judged plans") as on_progress:
         result = exam.judge(setup, given, on_progress)
     report = report_of(setup, result)
-    text = text_report(report, rows)
+    text = printable(text_report(report, rows), lines=True)
     _write(folder / "report.json", json.dumps(report, indent=1) + "\n")
     _write(folder / "report.txt", text)
     _write(folder / "report.html", evaluation_page(report, result.pictures, rows))

@@ -1,5 +1,6 @@
 """Text of other machines, made safe for terminals and log files."""
 
+import json
 import re
 from typing import Final
 
@@ -9,9 +10,12 @@ _CONTROL_WITHIN_LINES: Final = re.compile(rf"(?![\n\t]){_CONTROL.pattern}")
 
 
 def printable(text: str, *, lines: bool = False) -> str:
-    """Return the text with control characters written as escapes such as ``\\x1b``. ``lines`` keeps newlines and tabs."""
+    """Return the text with control characters written as JSON's escapes, such as ``\\u001b``.
+
+    ``lines`` keeps newlines and tabs. JSON stays JSON.
+    """
     return (_CONTROL_WITHIN_LINES if lines else _CONTROL).sub(_escape, text)
 
 
 def _escape(found: re.Match[str]) -> str:
-    return ascii(found[0])[1:-1]
+    return json.dumps(found[0])[1:-1]

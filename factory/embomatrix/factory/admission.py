@@ -12,9 +12,11 @@ from typing import Final, Protocol, TypeVar
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.planner.oracle import PlanNotFound
+from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Trace
 from embomatrix.world.bddl import InitLiteral
+from embomatrix.world.dataset import DatasetError, TaskRecord
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
 from embomatrix.world.goal import Facts, Not
 from embomatrix.world.task import Task
@@ -77,6 +79,17 @@ class PlanExecutor(Protocol):
 
 
 S = TypeVar("S", bound=PlanExecutor)
+
+
+def oracle_plan(record: TaskRecord) -> Plan:
+    """Return the record's oracle plan. Raise DatasetError if it can't be read."""
+    task = record.task
+    try:
+        return plan_from_json(list(record.oracle), task.profile)
+    except PlanError as error:
+        raise DatasetError(
+            f"the oracle plan of task {task.task_id!r} can't be read: {error}; build the dataset again"
+        ) from error
 
 
 def admit(

@@ -27,6 +27,11 @@ def test_printable_text_has_no_control_characters_and_keeps_the_others(text: str
 
 
 @given(st.text())
+def test_json_stays_json_of_the_same_value(text: str) -> None:
+    assert json.loads(printable(json.dumps([text], ensure_ascii=False, indent=1), lines=True)) == [text]
+
+
+@given(st.text())
 def test_a_log_line_about_any_name_is_one_line(name: str) -> None:
     for formatter in (HumanFormatter(), JsonFormatter()):
         line = formatter.format(record("opened run=%s", name))
@@ -36,7 +41,7 @@ def test_a_log_line_about_any_name_is_one_line(name: str) -> None:
 
 def test_a_json_line_about_a_hostile_name_is_valid_json() -> None:
     line = JsonFormatter().format(record("opened run=%s", "a\x1b[2J\u202e\n{"))
-    assert json.loads(line)["run"] == "a\\x1b[2J\\u202e\n{"
+    assert json.loads(line)["run"] == "a\\u001b[2J\\u202e\n{"
 
 
 def test_lines_of_a_kind_are_limited_and_the_next_one_counts_the_suppressed() -> None:
@@ -53,4 +58,4 @@ def test_a_run_named_with_markup_and_escape_sequences_is_shown_as_text() -> None
     console = Console(width=200, record=True, force_terminal=False)
     console.print(run_table([RunInfo("r1", "[/bold]\x1b[2J\nforged", RunStats(), 0)]))
     text = console.export_text()
-    assert "[/bold]\\x1b[2J\\nforged" in text
+    assert "[/bold]\\u001b[2J\\nforged" in text

@@ -24,6 +24,7 @@ from embomatrix.cli.cluster.trace import chrome_trace
 from embomatrix.cli.connection import AsJson, manager_command
 from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
+from embomatrix.host.printable import printable
 from embomatrix.rpc.admin_client import AdminClient
 
 T = TypeVar("T")
@@ -115,7 +116,7 @@ async def explain(
     begin_s = found.steps[0].at_s if found.steps else 0.0
     for step in found.steps:
         console.print(step_line(step, begin_s))
-    console.print(f"now: {found.place or 'it has its outcome'}", markup=False)
+    console.print(f"now: {printable(found.place) or 'it has its outcome'}", markup=False)
 
 
 @app.command()

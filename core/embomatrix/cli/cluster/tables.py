@@ -45,7 +45,7 @@ def show(table: Table) -> None:
 
 def show_json(value: object) -> None:
     """Print a value as JSON; dataclasses become objects."""
-    print(json.dumps(value, default=to_jsonable_python, ensure_ascii=False))
+    print(printable(json.dumps(value, default=to_jsonable_python, ensure_ascii=False)))
 
 
 def event_plain(event: RunEvent) -> dict[str, Any]:

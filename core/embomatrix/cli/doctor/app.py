@@ -16,6 +16,7 @@ from embomatrix.cli.connection import AsJson
 from embomatrix.cli.doctor.machine import NEEDED, Finding, Level, machine, verdict
 from embomatrix.cli.doctor.manager import Visit, manager, ports_held
 from embomatrix.host.failure import MENDABLE, fail
+from embomatrix.host.printable import printable
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.options import Ca, Manager, Token
@@ -73,10 +74,12 @@ def _show(findings: Sequence[Finding]) -> None:
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for finding in findings:
-        found = Text(finding.found)
+        found = Text(printable(finding.found))
         if finding.remedy:
-            found.append(f"\n{finding.remedy}", style="dim")
-        table.add_row(Text(finding.level.value, style=STYLES[finding.level]), finding.thing, found)
+            found.append(f"\n{printable(finding.remedy)}", style="dim")
+        table.add_row(
+            Text(finding.level.value, style=STYLES[finding.level]), Text(printable(finding.thing)), found
+        )
     console = Console(highlight=False)
     console.print(table)
-    console.print(f"\n{verdict(findings)}", markup=False)
+    console.print(f"\n{printable(verdict(findings))}", markup=False)

@@ -18,7 +18,7 @@ from embomatrix.factory.commands.language_model import (
     chat_model,
     model_layout_agents,
 )
-from embomatrix.factory.commands.terminal import fail, user_errors
+from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, MODEL_BACKED, AgentInterface, AgentName
 from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent, answer_with_model
 from embomatrix.factory.social.model_agents import SocialModelAgents
@@ -59,7 +59,7 @@ def agent(
         value = interface.read(sys.stdin.read() if str(brief) == "-" else brief.read_text(encoding="utf-8"))
         use_model = bool(llm) or cassette is not None
         answer = _ask_model(name, value, llm, model, key, cassette) if use_model else interface.rules(value)
-        typer.echo(interface.to_json(answer))
+        say(interface.to_json(answer))
 
 
 def _ask_model(name: str, brief: Any, url: str, model: str, key: str, cassette: Path | None) -> Any:

@@ -80,9 +80,9 @@ def lay(
 def _show(layout: Layout) -> None:
     labels = {scene_name: name for name, scene_name in layout.names.items()}
     for tree in layout.trees.values():
-        typer.echo(tree.drawn(labels))
+        say(tree.drawn(labels))
     for failure in layout.failures:
-        typer.echo(
+        say(
             f"not placed: {failure.object_name} {failure.relation} {failure.host}: {failure.reason}, {failure.detail}"
         )
 

@@ -8,11 +8,12 @@ from typing import Annotated, Final
 
 import typer
 from rich.console import Console
-from rich.markup import escape
+from rich.markup import escape as without_markup
 from rich.table import Table
 
 from embomatrix.factory.commands.terminal import counter, fail, user_errors
 from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
+from embomatrix.host.printable import printable
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score, unparsable
 from embomatrix.sim.film import Film, film_cached
@@ -35,6 +36,11 @@ DEFAULT_DATASET: Final = "build/dataset"
 NO_PLAN: Final = 1
 
 console = Console(highlight=False)
+
+
+def escape(text: str) -> str:
+    """Return text of a dataset or plan without markup and control characters."""
+    return without_markup(printable(text))
 
 
 class PlayMode(StrEnum):

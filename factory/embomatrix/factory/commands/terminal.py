@@ -17,6 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Column, Table
+from rich.text import Text
 
 from embomatrix.factory.metrics.figures import (
     EvaluationError,
@@ -26,6 +27,7 @@ from embomatrix.factory.metrics.figures import (
 )
 from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.host import failure
+from embomatrix.host.printable import printable
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
@@ -47,15 +49,15 @@ USER_ERRORS: Final = (
 
 
 def say(line: object) -> None:
-    """Print a line as it is, on one line of output however long it is."""
-    Console(soft_wrap=True).print(str(line), highlight=False, markup=False)
+    """Print a line on one line of output however long it is, with control characters escaped."""
+    Console(soft_wrap=True).print(printable(str(line), lines=True), highlight=False, markup=False)
 
 
 def show_table(columns: Iterable[str | Column], rows: Iterable[Iterable[object]], title: str = "") -> None:
     """Print a table of values."""
     table = Table(*columns, title=title or None)
     for row in rows:
-        table.add_row(*map(str, row))
+        table.add_row(*(Text(printable(str(value))) for value in row))
     Console().print(table)
 
 

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import SEED, PlanFailure, TaskRefusal, admit, plan_failure
+from embomatrix.factory.admission import SEED, PlanFailure, TaskRefusal, admit, oracle_plan, plan_failure
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.task_import.batch import max_held_share
 from embomatrix.pages.figures import Better, Figure
@@ -24,7 +24,7 @@ from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
-from embomatrix.skills.parse import plan_from_json, plan_to_json
+from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 
@@ -127,7 +127,7 @@ def _cached(simulator: Simulator, record: TaskRecord) -> Judgement:
 
 def _physical(bundle: Bundle, record: TaskRecord) -> PlanFailure | None:
     """Execute the dataset's plan with a robot in physics; return the failure, None if it reaches the goal."""
-    plan = plan_from_json(list(record.oracle), record.task.profile)
+    plan = oracle_plan(record)
     with contextlib.closing(physical_simulator(bundle)) as simulator:
         return plan_failure(simulator, record.task, plan)
 

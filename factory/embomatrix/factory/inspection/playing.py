@@ -4,14 +4,13 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from embomatrix.factory.admission import SEED
+from embomatrix.factory.admission import SEED, oracle_plan
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.describe import call_in_words
-from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.dataset import DatasetError, TaskRecord
+from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
 
 
@@ -48,13 +47,7 @@ def play_oracle(record: TaskRecord, bundle: Bundle) -> OraclePlayback:
 
     Raise EngineError if the scene can't be loaded, DatasetError if the plan can't be read.
     """
-    task = record.task
-    try:
-        plan = plan_from_json(list(record.oracle), task.profile)
-    except PlanError as error:
-        raise DatasetError(
-            f"the oracle plan of task {task.task_id!r} can't be read: {error}; build the dataset again"
-        ) from error
+    task, plan = record.task, oracle_plan(record)
     with contextlib.closing(load_simulator(bundle)) as simulator:
         simulator.reset(task, SEED)
         moments = [_moment(simulator, record, "", "")]

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
+from embomatrix.host.printable import printable
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr, without_secrets
 from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings, given_options, read_config
@@ -206,11 +207,11 @@ def issue(
         manager, token, ca, lambda client: client.issue_token(wanted, valid_s=hours * 3600.0, label=label)
     )
     if wanted is not AccessRole.JOIN:
-        print(new)
-        typer.echo(f"id {token_id}; the token is not shown again", err=True)
+        print(printable(new))
+        typer.echo(f"id {printable(token_id)}; the token is not shown again", err=True)
         return
     pem = read_ca(ca).decode("ascii")
-    print(Invitation(manager, new, fingerprint_of(pem) if pem else ""))
+    print(printable(str(Invitation(manager, new, fingerprint_of(pem) if pem else ""))))
     typer.echo("on the machine that joins: embomatrix worker run --join with the line above", err=True)
 
 
@@ -220,8 +221,6 @@ def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
-
-    from embomatrix.host.printable import printable
 
     table = Table("id", "role", "label", "valid for", "worker")
     for info in _ask(manager, token, ca, lambda client: client.list_tokens()):

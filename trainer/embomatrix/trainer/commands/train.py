@@ -240,13 +240,14 @@ def _show_imitation(state: ImitationState, out: Path) -> None:
         f"{state.step} imitation steps in {state.seconds:.0f} s{best}\npolicy      {out / 'reference'}\n"
         f"continue    embomatrix train --resume --out={out}",
         highlight=False,
+        markup=False,
     )
 
 
 def _show_summary(summary: TrainingSummary) -> None:
     from embomatrix.trainer.logging.report import prewarm_share, success_rows
 
-    console = Console()
+    console = Console(markup=False)
     title = "held-out success, 95 % intervals"
     table = Table("tasks", "before GRPO", "after", "difference", title=title, title_justify="left")
     for row in success_rows(summary):

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from embomatrix.host.printable import printable
 from embomatrix.worker.commands.options import StateDir, fail
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.status import WorkerStatus, running_daemons
@@ -28,7 +29,7 @@ def status(
     console = Console(soft_wrap=True)
     for daemon in daemons:
         for line in describe(daemon, time.time()):
-            console.print(line, highlight=False, markup=False)
+            console.print(printable(line), highlight=False, markup=False)
 
 
 def describe(status: WorkerStatus, now_s: float) -> list[str]:
