@@ -1,4 +1,4 @@
-"""A refused call leaves nothing in the manager's memory, whatever its size, and silent connections end."""
+"""Memory of the manager after refused calls of any size, and the end of silent connections."""
 
 import asyncio
 import contextlib

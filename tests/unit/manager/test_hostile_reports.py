@@ -2,8 +2,10 @@
 
 import time
 import tracemalloc
+from dataclasses import replace
 
 import pytest
+from tests.fakes.worker import completed
 
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.events import (
@@ -11,10 +13,12 @@ from embomatrix.manager.control.events import (
     LeaseFinished,
     LookaheadAnnounced,
     RunOpened,
+    Tick,
     WorkerJoined,
     WorkerLost,
     WorkerReported,
 )
+from embomatrix.manager.control.schedule.readiness import BELIEVED_MB, SceneCosts
 from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
@@ -31,6 +35,7 @@ from embomatrix.rpc.wire.values import (
     Resources,
     Rollout,
     RunTerms,
+    Timings,
 )
 
 MACHINE = Resources(4, 4, 4096)
@@ -152,3 +157,35 @@ async def test_batch_of_more_scenes_than_may_wait_is_refused(runs):
     rollouts = tuple(Rollout(f"x{n}", "g", f"sha256:{n:064d}", "t", (), 0) for n in range(8_193))
     with pytest.raises(OverloadedError, match="has 8193 scenes"):
         await runs.submit(Batch("r0", "b1", 1, rollouts))
+
+
+@pytest.mark.parametrize("told", [{"memory_mb": 1e9}, {"load_s": 86_400.0}])
+def test_numbers_of_one_worker_keep_no_scene_from_the_others(cluster, told):
+    liar = Resident("kitchen", ResidentState.WARM, **{"load_s": 1.0, "memory_mb": 64.0, **told})
+    cluster.handle(WorkerJoined("w2", MACHINE), now_s=0.0)
+    cluster.handle(WorkerReported("w2", (), (), resync=True), now_s=0.0)
+    report(cluster, liar, now_s=1.0)
+    _execute_one(cluster)
+    rollouts = tuple(Rollout(f"x{number}", "g", "kitchen", "t", (), 0) for number in range(64))
+    cluster.handle(BatchSubmitted(Batch("r1", "b2", 1, rollouts)), now_s=2.0)
+    for at_s in range(3, 120):
+        cluster.handle(Tick(), now_s=float(at_s))
+    assert cluster.scheduler.desired("w2") == ("kitchen",)
+
+
+def test_memory_of_a_large_scene_counts_when_a_second_worker_measures_it():
+    costs = SceneCosts(guess_mb=64.0)
+    costs.learn("w1", Resident("hall", ResidentState.WARM, 1.0, 5_000.0))
+    assert costs.size_mb("hall") == BELIEVED_MB
+    for worker_id, memory_mb in (("w1", 9_000.0), ("w2", 4_000.0), ("w3", 3_000.0), ("w4", 4_500.0)):
+        costs.learn(worker_id, Resident("hall", ResidentState.WARM, 1.0, memory_mb))
+    assert costs.size_mb("hall") == 4_500.0
+
+
+def _execute_one(cluster):
+    """Have ``w1`` execute one rollout, so that the time of an execution is known."""
+    rollout = Rollout("x", "g", "kitchen", "t", (), 0)
+    commands = cluster.handle(BatchSubmitted(Batch("r1", "b1", 1, (rollout,))), now_s=1.0)
+    (lease,) = (command for command in commands if hasattr(command, "rollout"))
+    outcome = replace(completed(), timings=Timings(execute_s=1.0))
+    cluster.handle(LeaseFinished("w1", lease.ref, outcome), now_s=2.0)

@@ -10,6 +10,10 @@ from embomatrix.rpc.wire.values import LookaheadAnswer, PlanCell, Resident, Resi
 
 SCENES_KEPT: Final = 16_384
 """Scenes whose costs are remembered: those that workers reported last."""
+BELIEVED_MB: Final = 1_024.0
+"""Most memory of a scene that one worker's report proves. More counts as far as a second worker reports it."""
+BELIEVED_S: Final = 60.0
+"""Longest load time that is learnt, so that one false report does not keep scenes from other workers."""
 LEARNING: Final = 0.05
 """Weight of the latest measurement in moving averages."""
 
@@ -20,6 +24,8 @@ class SceneCosts:
     def __init__(self, guess_mb: float) -> None:
         self._guess_mb = guess_mb
         self.measured_mb: OrderedDict[str, float] = OrderedDict()
+        self._large: dict[str, list[tuple[float, str]]] = {}
+        #: Scenes reported beyond ``BELIEVED_MB``: the two largest reports of different workers.
         self.load_s: OrderedDict[str, float] = OrderedDict()
         self.typical_load_s = 0.0
         self.execute_s = 0.0
@@ -32,23 +38,35 @@ class SceneCosts:
         """Return the load time of the scene, or of a typical one."""
         return self.load_s.get(scene, self.typical_load_s)
 
-    def learn(self, resident: Resident) -> None:
-        scene = resident.bundle_digest
+    def learn(self, worker_id: str, resident: Resident) -> None:
+        scene, load_s = resident.bundle_digest, min(resident.load_s, BELIEVED_S)
         if resident.memory_mb > 0:
-            self.measured_mb[scene] = max(self.measured_mb.get(scene, 0.0), resident.memory_mb)
-        if resident.state is ResidentState.WARM and resident.load_s > 0:
-            before_s = self.load_s.get(scene, resident.load_s)
-            self.load_s[scene] = 0.5 * (before_s + resident.load_s)
-            self.typical_load_s = _averaged(self.typical_load_s, resident.load_s)
+            proven_mb = self._proven_mb(worker_id, scene, resident.memory_mb)
+            self.measured_mb[scene] = max(self.measured_mb.get(scene, 0.0), proven_mb)
+        if resident.state is ResidentState.WARM and load_s > 0:
+            self.load_s[scene] = 0.5 * (self.load_s.get(scene, load_s) + load_s)
+            self.typical_load_s = _averaged(self.typical_load_s, load_s)
         for costs in (self.measured_mb, self.load_s):
             if scene in costs:
                 costs.move_to_end(scene)
             if len(costs) > SCENES_KEPT:
-                costs.popitem(last=False)
+                forgotten, _ = costs.popitem(last=False)
+                if costs is self.measured_mb:
+                    self._large.pop(forgotten, None)
 
     def executed(self, seconds: float) -> None:
         """Add an execution time, in seconds on a slot of speed 1."""
         self.execute_s = _averaged(self.execute_s, seconds)
+
+    def _proven_mb(self, worker_id: str, scene: str, memory_mb: float) -> float:
+        """Return the part of the reported memory that one worker may prove, or that two agree on."""
+        if memory_mb <= BELIEVED_MB:
+            return memory_mb
+        reports = {name: size for size, name in self._large.get(scene, ())}
+        reports[worker_id] = max(reports.get(worker_id, 0.0), memory_mb)
+        largest = sorted(((size, name) for name, size in reports.items()), reverse=True)[:2]
+        self._large[scene] = largest
+        return largest[1][0] if len(largest) > 1 else BELIEVED_MB
 
 
 class ReadinessForecast:

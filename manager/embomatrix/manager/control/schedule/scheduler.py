@@ -242,7 +242,7 @@ class Scheduler:
         residency.residents = {scene: reported[scene] for scene in dict.fromkeys([*known, *reported])}
         for resident in event.residents:
             residency.note(resident, self._now_s)
-            self._costs.learn(resident)
+            self._costs.learn(event.worker_id, resident)
         self._residencies.changed(residency)
         return urgency
 
