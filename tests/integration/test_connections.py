@@ -26,6 +26,12 @@ class Patient(BoundedConnections):
     silent_s = 60.0
 
 
+class FairListener(BoundedListener):
+    limit = 4 * MOST
+    per_address = MOST
+    handshake_s = 60.0
+
+
 class HastyListener(BoundedListener):
     limit = MOST
     handshake_s = 0.5
@@ -87,6 +93,43 @@ async def test_connections_beyond_the_limit_are_closed_at_once():
             writer.close()
 
 
+async def test_connections_of_one_address_are_limited():
+    """The first address has its share, is refused beyond it, and gets it again when its connections ended."""
+    with FairListener(socket.AF_INET, socket.SOCK_STREAM) as bound:
+        bound.bind(("127.0.0.1", 0))
+        bound.listen()
+        kind = connections_of(bound)
+        kind.per_address = MOST
+        async with serving(kind, bound) as port:
+            opened = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
+            assert await served(opened) == [True] * MOST
+            more = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
+            assert await served(more) == [False] * MOST
+            other = [await asyncio.open_connection("127.0.0.1", port, local_addr=("127.0.0.2", 0))]
+            assert await served(other) == [True]
+            for reader, writer in opened:
+                writer.write(b"GET / HTTP/1.1\r\nhost: here\r\nconnection: close\r\n\r\n")
+                await reader.read()
+                writer.close()
+            again = [await asyncio.open_connection("127.0.0.1", port)]
+            assert await served(again) == [True]
+            again[0][1].close()
+            other[0][1].close()
+
+
+async def served(opened):
+    """Ask for a page on each connection; return which of them answer."""
+    for _, writer in opened:
+        writer.write(b"GET / HTTP/1.1\r\nhost: here\r\n\r\n")
+    return [await _answers(reader) for reader, _ in opened]
+
+
+async def _answers(reader):
+    with contextlib.suppress(ConnectionError):
+        return b"200" in await reader.readline()
+    return False
+
+
 async def test_silent_connections_are_closed():
     async with serving(Few) as port:
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
@@ -112,6 +155,17 @@ async def test_pending_handshakes_are_bounded(tmp_path):
         again = await _shaking_hands(port, trusting)
         for _, writer in [asking, again, *silent, *more]:
             writer.close()
+
+
+async def test_pending_handshakes_of_one_address_leave_room_for_others(tmp_path):
+    async with serving_by_tls(FairListener, tmp_path) as (port, trusting):
+        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(8 * MOST)]
+        async with asyncio.timeout(10):
+            _, writer = await asyncio.open_connection(
+                "127.0.0.1", port, ssl=trusting, local_addr=("127.0.0.2", 0)
+            )
+        for _, ending in [(None, writer), *silent]:
+            ending.close()
 
 
 async def test_pending_handshakes_time_out(tmp_path):

@@ -24,6 +24,10 @@ FILES: Final = 65_536
 """Requested limit of open files: sockets of workers, trainers and viewers, bundles, and the store."""
 
 
+Peer = tuple[Any, ...]
+"""Address of a client: its host and its port, and two more numbers in IPv6."""
+
+
 class BoundedConnections(H11Protocol):
     """HTTP connection that is closed at once above ``CONNECTIONS``, and after ``SILENT_S`` without a request."""
 
@@ -62,9 +66,7 @@ class BoundedConnections(H11Protocol):
         if self._timer is not None:
             self._timer.cancel()
         if self.listener is not None and self._address is not None:
-            self.listener.by_address[self._address] -= 1
-            if not self.listener.by_address[self._address]:
-                del self.listener.by_address[self._address]
+            _count_down(self.listener.by_address, self._address)
             self._address = None
         super().connection_lost(exc)
 
@@ -72,6 +74,12 @@ class BoundedConnections(H11Protocol):
         # The first whole request creates the cycle.
         if self.cycle is None:
             self.transport.abort()
+
+
+def _count_down(counts: Counter[str], address: str) -> None:
+    counts[address] -= 1
+    if not counts[address]:
+        del counts[address]
 
 
 def connections_of(listener: BoundedListener) -> type[BoundedConnections]:
@@ -89,6 +97,8 @@ def allow_files() -> None:
 
 WAITING: Final = 256
 """Accepted connections without a finished handshake at most. TLS takes 300 kB for each."""
+WAITING_PER_ADDRESS: Final = 64
+"""Of those, from one address at most."""
 HANDSHAKE_S: Final = 10.0
 """Time limit of a handshake, in seconds."""
 REJECTED_AT_ONCE: Final = 256
@@ -96,34 +106,38 @@ REJECTED_AT_ONCE: Final = 256
 
 
 class BoundedListener(socket.socket):
-    """Listening socket for an asyncio server. When too many handshakes are pending, new connections are closed at
-    once.
+    """Listening socket for an asyncio server. When too many handshakes are pending, at all or of one address, new
+    connections are closed at once.
     """
 
     limit = WAITING
+    per_address = WAITING_PER_ADDRESS
     handshake_s = HANDSHAKE_S
 
     def __init__(self, *given: Any, **options: Any) -> None:
         super().__init__(*given, **options)
-        self._waiting: dict[object, asyncio.TimerHandle] = {}
+        self._waiting: dict[Peer, asyncio.TimerHandle] = {}
+        self._waiting_by_address: Counter[str] = Counter()
         self.by_address: Counter[str] = Counter()
         """Open HTTP connections by the client's address."""
 
     def accept(self) -> tuple[socket.socket, Any]:
         for _ in range(REJECTED_AT_ONCE):
             plain, peer = super().accept()
-            if len(self._waiting) < self.limit:
+            if len(self._waiting) < self.limit and self._waiting_by_address[peer[0]] < self.per_address:
                 return self._take_in(plain, peer), peer
             plain.close()
         raise BlockingIOError
 
-    def handshake_done(self, peer: object) -> None:
+    def handshake_done(self, peer: Peer) -> None:
         """Note that the connection from this address finished its handshake, or is closed."""
         timer = self._waiting.pop(peer, None)
         if timer is not None:
             timer.cancel()
+            _count_down(self._waiting_by_address, peer[0])
 
-    def _take_in(self, plain: socket.socket, peer: object) -> socket.socket:
+    def _take_in(self, plain: socket.socket, peer: Peer) -> socket.socket:
+        self._waiting_by_address[peer[0]] += 1
         accepted = _AcceptedSocket(plain, lambda: self.handshake_done(peer))
         self._waiting[peer] = asyncio.get_running_loop().call_later(self.handshake_s, accepted.shut_down)
         return accepted
