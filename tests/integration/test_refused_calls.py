@@ -13,7 +13,7 @@ from embomatrix.rpc.channel import CHANNEL_OPTIONS, SERVER_OPTIONS
 SECRET = "operators-secret"
 CALLS = 20
 MEGABYTES = 24
-"""Of each message. Kept until a garbage collection, twenty of them take 480 MB."""
+"""Size of each message. Kept until a garbage collection, twenty of them take 480 MB."""
 MOST_MB = 200.0
 
 

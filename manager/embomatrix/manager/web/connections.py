@@ -98,7 +98,7 @@ def allow_files() -> None:
 WAITING: Final = 256
 """Accepted connections without a finished handshake at most. TLS takes 300 kB for each."""
 WAITING_PER_ADDRESS: Final = 64
-"""Of those, from one address at most."""
+"""Largest number of them from one address."""
 HANDSHAKE_S: Final = 10.0
 """Time limit of a handshake, in seconds."""
 REJECTED_AT_ONCE: Final = 256
