@@ -30,6 +30,14 @@ def test_workers_without_a_fingerprint_are_compared_by_facts():
     assert opinion(versions={}).agrees(opinion("w2", {}, trace_digest="sha256:another"))
 
 
+def test_sentences_may_differ_but_not_be_padded():
+    assert opinion(final=("the cup is in the sink",)).agrees(opinion("w2", final=()))
+    padded = opinion("w2", final=("x" * 4_000,) * 3)
+    assert not opinion().agrees(padded)
+    assert judge([opinion(), padded, opinion("w3")]) == ((0, 2), (1,))
+    assert opinion(final=("y" * 4_000,)).agrees(padded)
+
+
 def test_only_an_opinion_against_two_that_agree_is_wrong():
     first, second, third = opinion("w1"), opinion("w2"), opinion("w3", trace_digest="invented")
     assert judge([first]) is None

@@ -19,6 +19,9 @@ PLATFORM: Final = "platform"
 """Name of the platform fingerprint among a worker's versions."""
 REWARD_DIGITS: Final = 6
 """Decimal places to which rewards of different platforms are compared: they are sums of the same few terms."""
+TEXT_CHARS: Final = 8_192
+TEXT_RATIO: Final = 4
+"""Texts of one execution may have this many characters more than ``TEXT_RATIO`` times those of another."""
 OPINIONS: Final = 3
 """Executions after which a case without two that agree is given up."""
 
@@ -53,17 +56,20 @@ class Opinion:
     """Digest of the trace, and the exact three tiers of the reward."""
     facts: str
     """Digest of atoms, success, step failures and the rounded reward."""
+    chars: int = 0
+    """Length of its texts. A worker that pads them fills the memory of the manager and the trainers."""
 
     def agrees(self, other: Opinion) -> bool:
         """True if both executions agree in everything that must be equal for equal plans."""
-        if self.facts != other.facts:
+        fewer, more = sorted((self.chars, other.chars))
+        if self.facts != other.facts or more > TEXT_RATIO * fewer + TEXT_CHARS:
             return False
         known = bool(self.platform.get(PLATFORM))
         return self.trace == other.trace if known and self.platform == other.platform else True
 
 
 def opinion_of(worker_id: str, platform: Mapping[str, str], completed: Completed) -> Opinion:
-    """Return the comparable part of a result, without texts and durations."""
+    """Return the comparable part of a result: without durations, and of texts only their length."""
     reward = completed.reward
     tiers = (reward.format, reward.relevance, reward.goal)
     facts = (
@@ -73,7 +79,8 @@ def opinion_of(worker_id: str, platform: Mapping[str, str], completed: Completed
         [round(tier, REWARD_DIGITS) for tier in tiers],
     )
     digest = hashlib.blake2b(repr(facts).encode(), digest_size=16).hexdigest()
-    return Opinion(worker_id, platform, (completed.trace_digest, *tiers), digest)
+    texts = (*completed.final, *(text for step in completed.steps for text in (step.message, step.blocker)))
+    return Opinion(worker_id, platform, (completed.trace_digest, *tiers), digest, sum(map(len, texts)))
 
 
 class AuditVerdict(NamedTuple):
