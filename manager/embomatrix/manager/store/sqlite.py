@@ -28,6 +28,14 @@ T = TypeVar("T")
 
 _FULL: Final = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
 """Error codes of a full disk or an exhausted quota."""
+_DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_MAGIC: Final = b"SQLite format 3\x00"
+_HEAD_BYTES: Final = 100
+"""Bytes of the head of a state file: SQLite's file format, section 1.3."""
+_JOURNAL_HEAD_BYTES: Final = 32
+_FRAME_HEAD_BYTES: Final = 24
+"""Bytes before the first frame of a journal, and before the page in each frame: section 4.1."""
+_RESTORE: Final = "restore it from a backup, or move it away to start without its runs and tokens"
 
 BUSY_S: Final = 5.0
 """Time that a transaction waits for another process that writes to the same file."""
@@ -88,12 +96,12 @@ class SqliteStore:
             self._db = sqlite3.connect(
                 path, timeout=0.0, check_same_thread=False, isolation_level=None, uri=isinstance(path, str)
             )
+            if not isinstance(path, str):
+                _check_whole(path, path.with_name(f"{path.name}-wal"))
             self._retry_while_busy(lambda: self._db.executescript(_SCHEMA))
         except (sqlite3.Error, OSError) as error:
-            full = getattr(error, "sqlite_errorcode", None) in _FULL
-            remedy = "make room on its disk" if full else "check its folder's permissions"
             raise StateError(
-                f"the state file {path} can't be used ({error}): {remedy}, or pass --state"
+                f"the state file {path} can't be used ({error}): {_remedy(error)}, or pass --state"
             ) from error
 
     async def claim(self, candidate: Candidate) -> Lead:
@@ -230,7 +238,9 @@ class SqliteStore:
                     raise StateFullError(
                         f"the state file {self._path} can't be written ({error}): make room on its disk"
                     ) from error
-                raise StateError(f"the state file {self._path} failed: {error}") from error
+                raise StateError(
+                    f"the state file {self._path} failed ({error}): {_remedy(error)}, or pass --state"
+                ) from error
 
     async def _on_thread(self, work: Callable[[], T]) -> T:
         thread = asyncio.ensure_future(asyncio.to_thread(work))
@@ -280,6 +290,47 @@ class SqliteStore:
                 self._db.execute("ROLLBACK")
             raise
         return answer
+
+
+def _remedy(error: Exception) -> str:
+    code = getattr(error, "sqlite_errorcode", 0)
+    if code in _FULL:
+        return "make room on its disk"
+    return _RESTORE if code & 0xFF in _DAMAGED else "check its folder's permissions"
+
+
+def _check_whole(path: Path, journal: Path) -> None:
+    """Raise StateError if the file lacks pages that its head counts and the journal does not hold.
+
+    SQLite reads a page that is cut off as zeros. It notices that in its trees, but not in long payloads.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    page_bytes, pages = int.from_bytes(head[16:18]), int.from_bytes(head[28:32])
+    if not head.startswith(_MAGIC) or page_bytes < _HEAD_BYTES:
+        return  # a new file, or one that SQLite refuses
+    whole = path.stat().st_size // page_bytes
+    lost = pages - whole
+    if lost > 0:
+        lost -= sum(whole < page <= pages for page in _pages_in(journal, page_bytes))
+    if lost > 0:
+        raise StateError(f"the state file {path} is damaged: it lacks {lost} of {pages} pages; {_RESTORE}")
+
+
+def _pages_in(journal: Path, page_bytes: int) -> set[int]:
+    """Return the numbers of the pages in the committed frames of a journal."""
+    committed: set[int] = set()
+    pending: set[int] = set()
+    with contextlib.suppress(FileNotFoundError), journal.open("rb") as file:
+        salts = file.read(_JOURNAL_HEAD_BYTES)[16:24]
+        while len(frame := file.read(_FRAME_HEAD_BYTES + page_bytes)) == _FRAME_HEAD_BYTES + page_bytes:
+            if frame[8:16] != salts:
+                break  # frames of an earlier use of the file
+            pending.add(int.from_bytes(frame[:4]))
+            if int.from_bytes(frame[4:8]):  # the last frame of a transaction
+                committed |= pending
+                pending.clear()
+    return committed
 
 
 def _is_busy(error: sqlite3.OperationalError) -> bool:
