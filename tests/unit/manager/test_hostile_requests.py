@@ -41,6 +41,14 @@ def test_plain_page_may_not_change_a_manager_behind_tls():
     assert rules(secure=False).refusal("POST", "/api/v1/rewards", plain) is None
 
 
+def test_host_and_origin_that_are_no_addresses_are_refused():
+    guarded = HttpRules(Gate(None, guarded=True, shared_token="secret"), frozenset({"localhost"}))
+    for host in ("[", "[::1", "a]b", "//["):
+        assert guarded.refusal("GET", "/", Headers({"host": host})).status_code == 400
+    for origin in ("http://[", "https://[::1", "//]"):
+        assert rules(secure=False).refusal("POST", "/api/v1/rewards", posted(origin)).status_code == 403
+
+
 def test_two_authorization_headers_over_http_are_refused():
     raw = [(b"host", b"manager.example"), (b"authorization", b"Bearer a"), (b"authorization", b"Bearer b")]
     refusal = rules(secure=False).refusal("GET", "/api/v1/runs", Headers(raw=raw))

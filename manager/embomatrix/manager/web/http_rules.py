@@ -72,7 +72,10 @@ class HttpRules:
         """Return True if a page of another origin sent the request. Programs send neither header."""
         origin = headers.get("origin")
         if origin is not None:
-            found = urlsplit(origin)
+            try:
+                found = urlsplit(origin)
+            except ValueError:
+                return True
             return found.netloc.lower() != host.lower() or (self.secure and found.scheme != "https")
         return headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
 
@@ -138,5 +141,8 @@ def _needed_role(path: str, *, changes: bool) -> AccessRole:
 
 
 def _name_of(host: str) -> str:
-    """Return the ``Host`` header without its port."""
-    return (urlsplit(f"//{host}").hostname or "").lower()
+    """Return the ``Host`` header without its port; an empty text for one that is no host."""
+    try:
+        return (urlsplit(f"//{host}").hostname or "").lower()
+    except ValueError:
+        return ""
