@@ -8,6 +8,7 @@ from typing import Any
 
 from embomatrix.llm.ledger import append_line
 from embomatrix.llm.values import CassetteError, ChatModel, ChatRequest, Reply, Usage
+from embomatrix.world.json_text import parse_json
 
 
 class Cassette:
@@ -77,13 +78,13 @@ def digest(request: ChatRequest) -> str:
 
 def _read(path: Path) -> dict[tuple[str, int], Reply]:
     answers = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         try:
-            value = json.loads(line)
+            value = parse_json(line)
             usage = Usage(int(value["prompt_tokens"]), int(value["completion_tokens"]))
             reply = Reply(str(value["text"]), str(value["model"]), usage, str(value["finish"]), seconds=0.0)
             answers[str(value["question"]), int(value["number"])] = reply
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise CassetteError(
                 f"{path}, line {number}, is not a recorded answer ({error}): remove the line"
             ) from error

@@ -22,6 +22,8 @@ RETRIED: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Statuses that are worth a retry."""
 MAX_REPLY_BYTES: Final = 8 * 1024 * 1024
 MAX_RETRY_AFTER_S: Final = 60.0
+MOST_TOKENS: Final = 10**9
+"""Larger counts of tokens are no counts. They would overflow the sum of costs."""
 QUOTED: Final = 300
 """Characters of the endpoint's answer that an error quotes."""
 
@@ -147,7 +149,7 @@ def _judged(response: httpx.Response, data: bytes) -> dict[str, Any] | _Failure:
         value: dict[str, Any] = json.loads(data)
         if isinstance(value["choices"][0]["message"], dict):
             return value
-    except (ValueError, KeyError, IndexError, TypeError):
+    except (ValueError, KeyError, IndexError, TypeError, RecursionError):
         pass
     # A proxy that is starting up may send anything with status 200.
     return _Failure(f"its answer is not a chat completion ({_quoted(data)})", transient=True)
@@ -181,14 +183,19 @@ def _reply(value: dict[str, Any], model: str, seconds: float, retries: int) -> R
     usage = value.get("usage")
     counts = usage if isinstance(usage, dict) else {}
     return Reply(
-        text=content if isinstance(content, str) else "",
-        model=str(value.get("model") or model),
+        text=_sound(content) if isinstance(content, str) else "",
+        model=_sound(str(value.get("model") or model)),
         usage=Usage(_count(counts.get("prompt_tokens")), _count(counts.get("completion_tokens"))),
-        finish=str(choice.get("finish_reason") or ""),
+        finish=_sound(str(choice.get("finish_reason") or "")),
         seconds=seconds,
         retries=retries,
     )
 
 
+def _sound(text: str) -> str:
+    """Return the text with ``?`` for each half of a surrogate pair, which a model may emit and no file can hold."""
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
 def _count(value: object) -> int:
-    return value if isinstance(value, int) and value >= 0 else 0
+    return value if isinstance(value, int) and 0 <= value <= MOST_TOKENS else 0

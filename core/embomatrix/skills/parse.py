@@ -286,12 +286,21 @@ def _checked(arg: Arg, value: object, number: int) -> int | float | str:
                 return PlaceRelation(value.strip().lower())
             expected = f"one of {', '.join(PlaceRelation)}"
         case Arg.ROOM:
-            if isinstance(value, str) and 0 < len(value.strip()) <= MAX_ROOM_NAME:
+            if isinstance(value, str) and 0 < len(value.strip()) <= MAX_ROOM_NAME and _is_unicode(value):
                 return value.strip()
             expected = "the name of a room"
     raise PlanError(
         PlanReason.WRONG_ARGUMENT, f"step {number}: {arg.value} is {_shown(value)}: expected {expected}"
     )
+
+
+def _is_unicode(text: str) -> bool:
+    """False for a text with half a surrogate pair, which JSON can escape and no message can carry."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _finite(value: object) -> float | None:

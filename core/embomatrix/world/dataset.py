@@ -19,6 +19,7 @@ from embomatrix.world.bundle import Bundle, decode_bundle
 from embomatrix.world.codec_task import task_of, task_to_json
 from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError
 from embomatrix.world.intent import IntentClause
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.records import Record, SceneInvalidError, TaskJson, convert
 from embomatrix.world.task import Task
 from embomatrix.world.whole_file import read_whole, write_whole
@@ -67,7 +68,7 @@ class Dataset:
         """Read the records of a file of any name; its bundles lie beside it. Raises DatasetError."""
         folder = path.parent
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
+            lines = path.read_text(encoding="utf-8").split("\n")
         except OSError as error:
             raise DatasetError(
                 f"there is no dataset in {folder}: {path} can't be read ({error.strerror}); "
@@ -214,10 +215,10 @@ def record_from_json(value: object) -> TaskRecord:
 
 def _record(line: str, place: str) -> TaskRecord:
     try:
-        return record_from_json(json.loads(line))
+        return record_from_json(parse_json(line))
     except SceneInvalidError as error:
         raise DatasetError(f"{place} is damaged: {error}; {_REMEDY}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise DatasetError(f"{place} is damaged: expected a JSON object ({error}); {_REMEDY}") from error
 
 

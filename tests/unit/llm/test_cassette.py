@@ -51,14 +51,35 @@ async def test_changed_question_is_reported(tmp_path):
         await replayed(path, OTHER)
 
 
-@pytest.mark.parametrize("line", ["{", "[]", '{"question": 3}'])
+FIELDS = '"question": "q", "number": 0, "text": "", "model": "", "completion_tokens": 0, "finish": ""'
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"{",
+        b"[]",
+        b'{"question": 3}',
+        b"[" * 100_000,
+        b'"\xff"',
+        f'{{{FIELDS}, "prompt_tokens": 1e999}}'.encode(),
+    ],
+)
 async def test_damaged_line_is_reported(tmp_path, line):
     path = tmp_path / "cast.jsonl"
     await recorded(path, QUESTION)
-    with path.open("a") as file:
-        file.write(f"{line}\n")
+    with path.open("ab") as file:
+        file.write(line + b"\n")
     with pytest.raises(CassetteError, match="line 2, is not a recorded answer"):
         Cassette(path)
+
+
+async def test_answer_with_any_line_separator_is_replayed(tmp_path):
+    text = "one\u2028two\x85three\x1cfour"
+    with ChatServer(text).serving() as url:
+        async with Endpoint(url, "small-1") as endpoint:
+            await Cassette(tmp_path / "cast.jsonl", endpoint).complete(QUESTION)
+    assert await replayed(tmp_path / "cast.jsonl", QUESTION) == [text]
 
 
 def test_missing_cassette_without_a_model_is_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+from dataclasses import replace
 
 import pytest
 from tests.fakes.chat_server import ChatServer
@@ -49,12 +50,28 @@ async def test_images_are_sent_as_data_urls():
         (503, {}, "<html>starting</html>", 0.0),
         (200, {}, "<html>a proxy</html>", 0.0),
         (200, {}, '{"choices": []}', 0.0),
+        (200, {}, "[" * 100_000, 0.0),
     ],
 )
 async def test_transient_failures_are_retried(trouble):
     server = ChatServer(trouble, trouble, "Ann.")
     reply = await asked(server)
     assert (reply.text, reply.retries, len(server.requests)) == ("Ann.", 2, 3)
+
+
+async def test_half_of_a_surrogate_pair_in_an_answer_can_be_sent_and_stored():
+    server = ChatServer("yes \ud83d", "no")
+    reply = await asked(server)
+    assert reply.text == "yes ?"
+    history = (*QUESTION.messages, Message(Speaker.ASSISTANT, reply.text))
+    assert (await asked(server, replace(QUESTION, messages=history))).text == "no"
+
+
+@pytest.mark.parametrize("count", ["1e999", "-1", "9" * 400, '"3"'])
+async def test_impossible_token_counts_are_none(count):
+    body = '{"choices": [{"message": {"content": "a"}}], "usage": {"prompt_tokens": %s}}'
+    reply = await asked(ChatServer((200, {}, body % count, 0.0)))
+    assert reply.usage == Usage(0, 0)
 
 
 @pytest.mark.parametrize(

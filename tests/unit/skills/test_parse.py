@@ -110,6 +110,8 @@ ERRORS: dict[str, PlanReason] = {
     '[{"action": "turn", "yaw": 1' + "0" * 400 + "}]": PlanReason.WRONG_ARGUMENT,
     '[{"action": "go_to_room", "room_name": ""}]': PlanReason.WRONG_ARGUMENT,
     '[{"action": "go_to_room", "room_name": 4}]': PlanReason.WRONG_ARGUMENT,
+    r'[{"action": "go_to_room", "room_name": "kitchen\ud83d"}]': PlanReason.WRONG_ARGUMENT,
+    "go_to_room kitchen\ud83d": PlanReason.WRONG_ARGUMENT,
     "turn nan": PlanReason.WRONG_ARGUMENT,
     "turn inf": PlanReason.WRONG_ARGUMENT,
     "move 3 4": PlanReason.WRONG_ARGUMENT,

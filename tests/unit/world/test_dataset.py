@@ -80,6 +80,20 @@ def test_missing_and_damaged_bundles_are_named(tmp_path: Path, bundle: Bundle, t
         Dataset.load(tmp_path).bundle(record.bundle_digest)
 
 
+@pytest.mark.parametrize("text", ["[" * 100_000, r'{"task": "\ud800"}'])
+def test_line_that_no_program_can_carry_is_damaged(tmp_path: Path, text: str) -> None:
+    (tmp_path / TASKS_FILE).write_text(text)
+    with pytest.raises(DatasetError, match=r"tasks\.jsonl:1 is damaged: .*(nested too deep|surrogate pair)"):
+        Dataset.load(tmp_path)
+
+
+def test_instruction_with_any_line_separator_is_one_line(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    value = record_to_json(write(tmp_path, bundle, task))
+    value["task"]["instruction"] = "Open\u2028the\x85fridge."
+    (tmp_path / TASKS_FILE).write_text(json.dumps(value, ensure_ascii=False), encoding="utf-8")
+    assert Dataset.load(tmp_path).records[0].task.instruction == "Open\u2028the\x85fridge."
+
+
 @pytest.mark.parametrize("digest", ["", "sha256:../../etc/passwd", "md5:00", "sha256:" + "g" * 64])
 def test_malformed_digest_never_becomes_a_path(
     tmp_path: Path, bundle: Bundle, task: Task, digest: str

@@ -1,6 +1,5 @@
 """Admission figures from a build's ledger: share of admitted drafts, reasons against the others, tasks per hour."""
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, TIMES_FILE, build_settings
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.world.json_text import parse_json
 
 GOAL_PERCENT: Final = 90.0
 GOAL_PER_HOUR: Final = 1000.0
@@ -74,7 +74,7 @@ def _times(path: Path) -> Iterator[dict[str, Any]]:
         return
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
-            value = json.loads(line)
+            value = parse_json(line)
         except ValueError:
             continue
         if isinstance(value, dict) and isinstance(value.get("cpu_s"), int | float):
@@ -86,7 +86,7 @@ def _attempts(folder: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     try:
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        lines = [parse_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
         return [{**line, "outcome": line["outcome"]} for line in lines]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(

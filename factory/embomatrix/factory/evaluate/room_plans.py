@@ -1,7 +1,6 @@
 """Simplified rooms for the aesthetics score: furniture as boxes on a rectangle, and small objects on the furniture."""
 
 import gzip
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from embomatrix.factory.metrics.figures import EvaluationError
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.scene import Scene
 
 FLOOR: Final = "floor"
@@ -117,7 +117,7 @@ def read_rooms(path: Path) -> list[RoomPlan]:
     """Read the hand-made rooms of iTHOR and RoboTHOR from the table described in `docs/tasks.md`. Raises EvaluationError."""
     try:
         with gzip.open(path, "rt", encoding="utf-8") as file:
-            value = json.load(file)
+            value = parse_json(file.read())
         return [_room_from(room, number) for number, room in enumerate(value["rooms"])]
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise EvaluationError(

@@ -13,6 +13,7 @@ import trimesh
 
 from embomatrix.factory.importers.model import Mesh, ModelFileError
 from embomatrix.world.geometry import FloatArray
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 MAX_HULLS: Final = 16
@@ -111,7 +112,7 @@ def default_cache() -> Path:
 def _kept(path: Path) -> list[FloatArray] | None:
     """Return the pieces of a cache file; None if it is missing or damaged."""
     try:
-        pieces = [np.asarray(piece, dtype=np.float64) for piece in json.loads(path.read_bytes())]
+        pieces = [np.asarray(piece, dtype=np.float64) for piece in parse_json(path.read_bytes())]
     except (OSError, ValueError):
         return None
     sound = all(piece.ndim == 2 and piece.shape[1] == 3 and np.isfinite(piece).all() for piece in pieces)

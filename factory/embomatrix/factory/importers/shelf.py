@@ -8,6 +8,7 @@ from typing import Final
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.world.asset import Asset
 from embomatrix.world.codec import asset_from_json, asset_to_json
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.whole_file import read_whole, write_whole
 
@@ -31,7 +32,7 @@ def read_assets(folder: Path) -> Mapping[str, Asset]:
     found: dict[str, Asset] = {}
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         try:
-            asset = asset_from_json(json.loads(read_whole(path, at_most=MAX_BYTES)))
+            asset = asset_from_json(parse_json(read_whole(path, at_most=MAX_BYTES)))
         except (OSError, ValueError, SceneInvalidError) as error:
             raise ModelFileError(
                 f"{path} is not a readable asset ({error}): import the model again"

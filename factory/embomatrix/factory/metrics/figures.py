@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from embomatrix.pages.figures import Figure, figure_from_json, figure_to_json
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 
@@ -53,7 +54,7 @@ def write_evaluation(path: Path, evaluation: EvaluationFigures) -> None:
 def read_evaluation(path: Path) -> EvaluationFigures:
     """Read a file that `write_evaluation` wrote. Raise EvaluationError for any other content."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = parse_json(path.read_bytes())
         return EvaluationFigures(
             str(value["part"]),
             dict(value["conditions"]),

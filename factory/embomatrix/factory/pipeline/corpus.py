@@ -15,6 +15,7 @@ from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, write_dataset
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 HELDOUT_SCENES: Final = (
@@ -98,7 +99,7 @@ def check_frozen(folder: Path) -> Frozen:
     """Check that a corpus matches its frozen digest and that training is separate from it. Raise DatasetError."""
     path = folder / VERIFIED / FROZEN_FILE
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = parse_json(path.read_bytes())
         recorded = Frozen(value["tasks"], value["unseen"], tuple(value["scenes"]), value["digest"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DatasetError(

@@ -17,6 +17,7 @@ from embomatrix.world.dataset import (
     record_from_json,
     record_to_json,
 )
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class ResumableLog(Generic[T]):
         wanted = json.loads(json.dumps(settings))
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()
-            found = json.loads(lines[0])
+            found = parse_json(lines[0])
         except (ValueError, IndexError):
             found = None
         if not isinstance(found, dict) or found.keys() != wanted.keys():
@@ -72,7 +73,7 @@ def _read_outcomes(path: Path, lines: list[str], read: Callable[[Any], T]) -> li
     outcomes: list[T] = []
     for number, line in enumerate(lines[1:], start=2):
         try:
-            outcomes.append(read(json.loads(line)))
+            outcomes.append(read(parse_json(line)))
         except (ValueError, TypeError, KeyError) as error:
             if number != len(lines):
                 raise DatasetError(
@@ -149,7 +150,7 @@ def build_settings(folder: Path) -> dict[str, Any]:
     path = folder / BUILD_FILE
     try:
         with path.open(encoding="utf-8") as file:
-            return dict(json.loads(file.readline())["settings"])
+            return dict(parse_json(file.readline())["settings"])
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise DatasetError(
             f"{path} does not hold the settings of a build ({error}): name a folder written by `factory build`, "

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from embomatrix.world.codec import scene_from_json, scene_to_json
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import read_whole, write_whole
@@ -28,12 +29,12 @@ def read_scene(path: Path) -> Scene:
     if not path.is_file():
         raise _unusable(path, "is not a file")
     try:
-        return scene_from_json(json.loads(read_whole(path, at_most=MAX_BYTES)))
+        return scene_from_json(parse_json(read_whole(path, at_most=MAX_BYTES)))
     except OSError as error:
         raise _unusable(path, f"can't be read ({error.strerror})") from error
     except SceneInvalidError as error:
         raise _unusable(path, f"is not a scene ({error})") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise _unusable(path, f"is not JSON ({error})") from error
 
 

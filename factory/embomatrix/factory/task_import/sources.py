@@ -2,12 +2,12 @@
 
 import difflib
 import importlib.util
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import read_whole
 
 MAX_PROBLEM_BYTES: Final = 1024 * 1024
@@ -89,11 +89,11 @@ def read_jsonl(path: Path) -> Iterator[SourceText]:
 
     Raise ProblemSourceError that names the line.
     """
-    for number, line in enumerate(_read(path).splitlines(), start=1):
+    for number, line in enumerate(_read(path).split("\n"), start=1):
         if not line.strip():
             continue
         try:
-            record = json.loads(line)
+            record = parse_json(line)
             name, text = record["name"], record["bddl"]
         except (ValueError, KeyError, TypeError) as error:
             raise ProblemSourceError(f"{path}:{number}: expected an object with 'name' and 'bddl'") from error
@@ -107,8 +107,8 @@ def read_eai(folder: Path) -> tuple[SourceText, ...]:
     """
     root = folder / EAI_FOLDER if (folder / EAI_FOLDER).is_dir() else folder
     try:
-        stats = json.loads(_read(root / "data" / "demo_stats.json"))
-        words = json.loads(_read(root / EAI_INSTRUCTIONS))
+        stats = parse_json(_read(root / "data" / "demo_stats.json"))
+        words = parse_json(_read(root / EAI_INSTRUCTIONS))
         return tuple(
             SourceText(
                 name=demo["task"],

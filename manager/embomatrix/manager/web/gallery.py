@@ -6,7 +6,6 @@ limited.
 
 import asyncio
 import functools
-import json
 import re
 from collections import Counter
 from pathlib import Path
@@ -27,6 +26,7 @@ from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord
 from embomatrix.world.evaluate import GoalError
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import read_whole
 
@@ -240,6 +240,6 @@ def _rooms(scene: Scene, record: TaskRecord, moments: list[MomentView]) -> list[
 def _parsed(text: str) -> object:
     """Return a parsed layout tree; None if there is none, or for invalid JSON."""
     try:
-        return json.loads(text) if text else None
-    except (ValueError, RecursionError):
+        return parse_json(text) if text else None
+    except ValueError:
         return None

@@ -12,6 +12,7 @@ from embomatrix.host.failure import fail
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.environment import JudgeEnvironment, default_folder, install
 from embomatrix.trainer.eai.judge import NativeJudge
+from embomatrix.world.json_text import parse_json
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 console = Console(highlight=False, markup=False, soft_wrap=True)
@@ -69,7 +70,7 @@ def judge_command(
 
 def _read(path: Path) -> list[dict[str, str]]:
     try:
-        value = json.loads(path.read_bytes())
+        value = parse_json(path.read_bytes())
         return [{name: str(entry[name]) for name in ("identifier", "llm_output")} for entry in value]
     except OSError as error:
         raise TrainerError(f"{path} can't be read ({error.strerror}): expected a JSON file") from error

@@ -16,6 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.world.json_text import parse_json
 
 VERSION: Final = 1
 """Version of the file format and of everything that a verdict depends on."""
@@ -182,9 +183,9 @@ def _read(path: Path) -> tuple[EvaluationSetup, dict[tuple[str, int], Answer], i
     if not lines:
         raise TrainerError(f"{path} contains no answers: expected the {FILE} of an evaluation")
     try:
-        header = json.loads(lines[0])
+        header = parse_json(lines[0])
         version = header.pop("answers")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise TrainerError(
             f"{path} is not an answer file (its first line has no version): expected the {FILE} of an evaluation"
         ) from error

@@ -11,6 +11,7 @@ from typing import Final
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import TrainingTask, read_tasks
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, record_to_json
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Profile
 
@@ -99,7 +100,7 @@ def _rejected(folder: Path) -> set[str]:
     """Names of the problems that an import rejected."""
     path = folder / IMPORT_REPORT
     try:
-        outcomes = json.loads(path.read_bytes())["outcomes"]
+        outcomes = parse_json(path.read_bytes())["outcomes"]
         return {str(outcome["name"]) for outcome in outcomes if outcome["reason"]}
     except FileNotFoundError:
         return set()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.scoreboard import estimate_to_json
 from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def report_of(setup: EvaluationSetup, result: ExamResult) -> dict[str, Any]:
 def read_row(path: Path, bench_digest: str) -> ScoreRow:
     """Read the row of another report on the same tasks. Raises TrainerError."""
     try:
-        value = json.loads(path.read_bytes())
+        value = parse_json(path.read_bytes())
         version, setup = value["report"], value["setup"]
         if version != VERSION:
             raise TrainerError(

@@ -14,6 +14,7 @@ import torch
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.protocol import Policy
+from embomatrix.world.json_text import parse_json
 
 SCHEMA = 3
 CHECKPOINTS = "checkpoints"
@@ -133,7 +134,7 @@ def _sync(folder: Path) -> None:
 def read_state(folder: Path) -> tuple[TrainingProgress, TrainSettings]:
     """Read a checkpoint's progress and settings. Raises TrainerError if it is damaged or of another version."""
     try:
-        state = json.loads((folder / _STATE).read_text(encoding="utf-8"))
+        state = parse_json((folder / _STATE).read_bytes())
         if state["schema"] != SCHEMA:
             raise TrainerError(
                 f"the checkpoint {folder} has schema {state['schema']}, this version reads {SCHEMA}: start a new run"

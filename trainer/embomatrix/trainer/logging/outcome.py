@@ -9,6 +9,7 @@ from pydantic import TypeAdapter
 
 from embomatrix.trainer.config.errors import TrainerError, reason_of
 from embomatrix.trainer.lifecycle.stopwatch import TimeShares
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 OUTCOME: Final = "outcome.json"
@@ -60,7 +61,7 @@ def read_outcome(folder: Path) -> RunOutcome:
     """Read an outcome. Raises TrainerError if it is missing or damaged."""
     path = folder / OUTCOME
     try:
-        value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        value: dict[str, Any] = parse_json(path.read_bytes())
         if value.pop("schema") != SCHEMA:
             raise TrainerError(f"{path} has another version than {SCHEMA}: train again with another --out")
         return TypeAdapter(RunOutcome).validate_python(value)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord
 from embomatrix.trainer.logging.trackers import GRPO_PHASE, IMITATION_PHASE, Tracker
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -64,10 +65,8 @@ class Recorder:
         for name in names:
             path = self._folder / name
             if path.exists():
-                kept = [
-                    line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= step
-                ]
-                write_whole(path, "".join(f"{line}\n" for line in kept).encode("utf-8"))
+                kept = [line for line in path.read_bytes().splitlines() if _step_of(line) <= step]
+                write_whole(path, b"".join(line + b"\n" for line in kept))
 
     def _track(self, phase: str, row: Mapping[str, Any]) -> None:
         values = dict(numbers_of(row))
@@ -89,11 +88,11 @@ def numbers_of(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
             yield name, float(value)
 
 
-def _step_of(line: str) -> float:
+def _step_of(line: bytes) -> float:
     """Step of a line; infinity for a line that a crash truncated, so it is dropped."""
     try:
-        return int(json.loads(line)["step"])
-    except ValueError:
+        return int(parse_json(line)["step"])
+    except (ValueError, LookupError, TypeError, OverflowError):
         return math.inf
 
 

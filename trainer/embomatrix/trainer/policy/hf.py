@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +23,7 @@ from embomatrix.trainer.config.settings import LoraSettings, TrainSettings
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
 from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
+from embomatrix.world.json_text import parse_json
 
 HUB_TIMEOUT_S: Final = 10.0
 TOKENIZERS: Final = (
@@ -265,7 +265,7 @@ class HfPolicy:
     def codec_in(folder: Path) -> Codec | None:
         """Return the codec that a folder's model was trained in, None for other models."""
         try:
-            config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+            config = parse_json((folder / CONFIG).read_bytes())
             return Codec(config[CODEC_KEY])
         except (OSError, ValueError, TypeError, KeyError):
             return None

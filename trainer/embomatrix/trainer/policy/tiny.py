@@ -19,6 +19,7 @@ from embomatrix.trainer.policy.decoder import Decoder, DecoderShape, PlanCache, 
 from embomatrix.trainer.policy.grammar import GrammarState, PlanGrammar, PromptNames
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
 from embomatrix.trainer.policy.vocabulary import END, GO, PAD, Vocabulary
+from embomatrix.world.json_text import parse_json
 
 _COMPACTION_THRESHOLD = 0.6
 """Finished rows leave the sampling loop when this share or less is active: most plans are much shorter than the longest."""
@@ -206,7 +207,7 @@ class TinyPolicy:
     @classmethod
     def load(cls, folder: Path, *, device: str = "cpu", compute_dtype: torch.dtype = torch.float32) -> Self:
         """Load a policy that ``save`` wrote. Raises OSError, ValueError or RuntimeError if it is damaged."""
-        description = json.loads((folder / _DESCRIPTION).read_text())
+        description = parse_json((folder / _DESCRIPTION).read_bytes())
         shape = DecoderShape(**description["shape"])
         words, objects, rooms = (tuple(description[part]) for part in ("words", "objects", "rooms"))
         policy = cls(

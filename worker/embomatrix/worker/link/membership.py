@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fetch_ca, read_ca, read_token
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class MembershipFile:
     def read(self) -> Membership | None:
         """Read the membership; None without a file. Raise InvalidRequestError for an unreadable file."""
         try:
-            kept = json.loads(self._path.read_bytes())
+            kept = parse_json(self._path.read_bytes())
             return Membership(kept["manager"], kept["name"], kept["credential"], kept["ca"].encode("ascii"))
         except FileNotFoundError:
             return None

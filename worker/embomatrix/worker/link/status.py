@@ -14,6 +14,7 @@ from typing import Final
 
 import psutil
 
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 logger = logging.getLogger(__name__)
@@ -92,7 +93,7 @@ def running_daemons(state_dir: Path) -> list[WorkerStatus]:
     found = []
     for path in sorted((state_dir.expanduser() / FOLDER).glob("*.json")):
         try:
-            status = WorkerStatus(**json.loads(path.read_text(encoding="utf-8")))
+            status = WorkerStatus(**parse_json(path.read_bytes()))
         except (OSError, ValueError, TypeError):
             continue  # being removed, or of another version
         if _runs(status):
