@@ -13,6 +13,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
+import msgspec
+
 from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.status import (
     InvalidRequestError,
@@ -58,8 +60,9 @@ class Credential:
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Credential:
-        """Return the credential of stored fields."""
-        return cls(**{**fields, "role": AccessRole(fields["role"])})
+        """Return the credential of stored fields. Raises ValueError or TypeError for other fields or types."""
+        cls(**fields)  # refuses unknown fields
+        return msgspec.convert(fields, cls)
 
     def row(self) -> ShelfRow:
         return ShelfRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())

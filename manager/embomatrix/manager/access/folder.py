@@ -20,6 +20,7 @@ from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, Cr
 from embomatrix.manager.settings import LOOPBACK_NAMES
 from embomatrix.rpc.trust import fingerprint_of
 from embomatrix.rpc.wire.tokens import AccessRole
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
 FIRST_ROLES: Final = (AccessRole.ADMIN, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.JOIN)
@@ -58,7 +59,7 @@ class AccessFolder:
     def first_credentials(self) -> tuple[Credential, ...]:
         """Return the first credentials. Raises AccessError."""
         try:
-            return tuple(map(Credential.of, json.loads(self.hashes.read_bytes())))
+            return tuple(map(Credential.of, parse_json(self.hashes.read_bytes())))
         except (FileNotFoundError, NotADirectoryError):
             return ()
         except OSError as error:

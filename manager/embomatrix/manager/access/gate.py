@@ -2,7 +2,6 @@
 
 import asyncio
 import hmac
-import json
 import logging
 import time
 from collections.abc import Iterable, Sequence
@@ -14,7 +13,7 @@ import grpc
 from embomatrix.manager.access.credentials import NO_TOKEN, Credential, CredentialBook, is_remembered
 from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
-from embomatrix.manager.store.protocol import Shelf, StateError, StateStore
+from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError, StateStore, readable
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
 from embomatrix.rpc.status import (
     ClusterError,
@@ -24,6 +23,7 @@ from embomatrix.rpc.status import (
     UnavailableError,
 )
 from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
+from embomatrix.world.json_text import parse_json
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class Gate:
         Raises AccessError for a shared token that was issued for a role, since it would become an admin's.
         """
         now_s = time.time()
-        known = [Credential.of(json.loads(row.payload)) for row in await self._store.rows(Shelf.CREDENTIALS)]
+        known = [_credential_of(row) for row in await self._store.rows(Shelf.CREDENTIALS)]
         self._book.keep(*(credential for credential in known if is_remembered(credential, now_s=now_s)))
         fresh = [credential for credential in first if credential.token_id not in self._book]
         if fresh:
@@ -207,3 +207,8 @@ def the_token(headers: Sequence[str]) -> str:
 
 def _token_in(context: grpc.aio.ServicerContext) -> str:
     return the_token([value for key, value in context.invocation_metadata() or () if key == TOKEN_KEY])
+
+
+def _credential_of(row: ShelfRow) -> Credential:
+    with readable(f"the credential {row.key!r}"):
+        return Credential.of(parse_json(row.payload))

@@ -10,10 +10,12 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Final
 
+import msgspec
+
 from embomatrix.manager.control.events import LookaheadAnnounced
 from embomatrix.manager.control.reputation import Reputation
 from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
-from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, ShelfRow
+from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, ShelfRow, readable
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.outcome import rollout_result_to_proto
@@ -33,6 +35,7 @@ from embomatrix.rpc.wire.values import (
     RolloutResult,
     RunTerms,
 )
+from embomatrix.world.json_text import parse_json
 
 _KINDS: Final[Mapping[str, type[Outcome]]] = {
     "completed": Completed,
@@ -54,7 +57,9 @@ def batch_row(batch: Batch) -> BatchRow:
 
 
 def batch_of(row: BatchRow) -> Batch:
-    return batch_from_proto(rollout_service_pb2.ExecuteRequest.FromString(row.payload))
+    """Return the batch of `batch_row`. Raises StateError."""
+    with readable(f"batch {row.batch_id!r} of run {row.run_id!r}"):
+        return batch_from_proto(rollout_service_pb2.ExecuteRequest.FromString(row.payload))
 
 
 def result_row(result: RolloutResult) -> ResultRow:
@@ -62,9 +67,10 @@ def result_row(result: RolloutResult) -> ResultRow:
 
 
 def group_and_kind(row: ResultRow) -> tuple[str, type[Outcome]]:
-    """Return the group and the kind of outcome of a result."""
-    message = types_pb2.RolloutResult.FromString(row.payload)
-    return message.group_id, _KINDS[message.WhichOneof("outcome") or "cancelled"]
+    """Return the group and the kind of outcome of a result. Raises StateError."""
+    with readable(f"the result of rollout {row.rollout_id!r}"):
+        message = types_pb2.RolloutResult.FromString(row.payload)
+        return message.group_id, _KINDS[message.WhichOneof("outcome") or "cancelled"]
 
 
 def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
@@ -82,8 +88,11 @@ def reputation_row(worker_id: str, worker_reputation: Reputation) -> ShelfRow:
 
 
 def reputation_of(row: ShelfRow) -> Reputation:
-    """Return the reputation of `reputation_row`."""
-    return Reputation(**json.loads(row.payload))
+    """Return the reputation of `reputation_row`. Raises StateError."""
+    with readable(f"the reputation of worker {row.key!r}"):
+        fields = parse_json(row.payload)
+        Reputation(**fields)  # refuses unknown fields
+        return msgspec.convert(fields, Reputation)
 
 
 def window_row(run_id: str, window: LookaheadWindow) -> ShelfRow:
@@ -94,10 +103,11 @@ def window_row(run_id: str, window: LookaheadWindow) -> ShelfRow:
 
 
 def announced_in(row: ShelfRow) -> LookaheadAnnounced:
-    """Return the window of `window_row`, as an announcement."""
-    message = rollout_service_pb2.AnnounceLookaheadRequest.FromString(row.payload)
-    entries = each("entries", lookahead_entry_from_proto, message.entries)
-    return LookaheadAnnounced(row.key, message.version, entries)
+    """Return the window of `window_row`, as an announcement. Raises StateError."""
+    with readable(f"the look-ahead window of run {row.key!r}"):
+        message = rollout_service_pb2.AnnounceLookaheadRequest.FromString(row.payload)
+        entries = each("entries", lookahead_entry_from_proto, message.entries)
+        return LookaheadAnnounced(row.key, message.version, entries)
 
 
 def terms_payload(terms: RunTerms) -> bytes:
@@ -105,5 +115,6 @@ def terms_payload(terms: RunTerms) -> bytes:
 
 
 def terms_of(row: RunRow) -> RunTerms:
-    """Return the terms of a stored run."""
-    return run_terms_from_proto(rollout_service_pb2.OpenRunRequest.FromString(row.terms))
+    """Return the terms of a stored run. Raises StateError."""
+    with readable(f"the terms of run {row.run_id!r}"):
+        return run_terms_from_proto(rollout_service_pb2.OpenRunRequest.FromString(row.terms))

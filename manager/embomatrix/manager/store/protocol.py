@@ -3,10 +3,13 @@
 Leases are not stored: the workers that hold them report them.
 """
 
-from collections.abc import Collection, Sequence
+import contextlib
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
+
+from google.protobuf.message import DecodeError
 
 
 class StateError(Exception):
@@ -19,6 +22,18 @@ class StateFullError(StateError):
 
 class FencedError(StateError):
     """Another manager took the store over: this one must stop dispatching."""
+
+
+@contextlib.contextmanager
+def readable(row: str) -> Iterator[None]:
+    """Turn an error of reading stored bytes into StateError. ``row`` names them in its message."""
+    try:
+        yield
+    except (DecodeError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise StateError(
+            f"{row} in the state store can't be read ({error}): it is damaged, or of another version; restore the store from "
+            "a backup, or pass another --state"
+        ) from error
 
 
 class PutOutcome(StrEnum):

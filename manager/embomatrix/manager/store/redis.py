@@ -28,6 +28,7 @@ from embomatrix.manager.store.protocol import (
     ShelfRow,
     StateError,
     StateFullError,
+    readable,
 )
 from embomatrix.rpc.logs import without_secrets
 
@@ -172,7 +173,8 @@ class RedisStore:
         found = await self._call(
             self._redis.zrangebyscore(key, f"({cursor}", "+inf", start=0, num=limit, withscores=True)
         )
-        return [_row(int(score), member) for member, score in found]
+        with readable(f"a result of batch {batch_id!r}"):
+            return [_row(int(score), member) for member, score in found]
 
     async def drop_batch(self, run_id: str, batch_id: str) -> None:
         await self._script(_DROP_BATCH, (*self._batch_keys(run_id, batch_id), f"batches:{run_id}"), batch_id)
@@ -181,14 +183,18 @@ class RedisStore:
         names = await self._call(self._redis.hgetall(self._key("runs")))
         order = await self._call(cast("Awaitable[Any]", self._redis.lrange(self._key("run_order"), 0, -1)))
         terms = await self._call(self._redis.hgetall(self._key("run_terms")))
-        return [RunRow(run_id.decode(), names[run_id].decode(), terms.get(run_id, b"")) for run_id in order]
+        with readable("a run"):
+            return [
+                RunRow(run_id.decode(), names[run_id].decode(), terms.get(run_id, b"")) for run_id in order
+            ]
 
     async def batches(self, run_id: str) -> list[BatchRow]:
         rows: list[BatchRow] = []
         for batch_id in await self._batch_ids(run_id):
             fields = await self._call(self._redis.hgetall(self._key(f"batch:{run_id}:{batch_id}")))
             if fields:
-                rows.append(BatchRow(run_id, batch_id, fields[b"digest"].decode(), fields[b"payload"]))
+                with readable(f"batch {batch_id!r} of run {run_id!r}"):
+                    rows.append(BatchRow(run_id, batch_id, fields[b"digest"].decode(), fields[b"payload"]))
         return rows
 
     async def put_workers(self, worker_ids: Collection[str]) -> None:
@@ -196,7 +202,8 @@ class RedisStore:
 
     async def workers(self) -> frozenset[str]:
         found = await self._call(cast("Awaitable[Any]", self._redis.smembers(self._key("workers"))))
-        return frozenset(worker_id.decode() for worker_id in found)
+        with readable("a worker's name"):
+            return frozenset(worker_id.decode() for worker_id in found)
 
     async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
         flat = [value for row in rows for value in (row.key, row.payload)]
@@ -204,7 +211,8 @@ class RedisStore:
 
     async def rows(self, shelf: Shelf) -> list[ShelfRow]:
         found = await self._call(self._redis.hgetall(self._key(shelf.value)))
-        return [ShelfRow(key.decode(), payload) for key, payload in found.items()]
+        with readable(f"a row of {shelf.value}"):
+            return [ShelfRow(key.decode(), payload) for key, payload in found.items()]
 
     async def close(self) -> None:
         with contextlib.suppress(StateError):
@@ -228,7 +236,8 @@ class RedisStore:
 
     async def _batch_ids(self, run_id: str) -> list[str]:
         ids = await self._call(self._redis.lrange(self._key(f"batches:{run_id}"), 0, -1))
-        return [batch_id.decode() for batch_id in ids]
+        with readable(f"the list of batches of run {run_id!r}"):
+            return [batch_id.decode() for batch_id in ids]
 
     def _batch_keys(self, run_id: str, batch_id: str) -> tuple[str, str, str]:
         return (f"batch:{run_id}:{batch_id}", f"done:{run_id}:{batch_id}", f"results:{run_id}:{batch_id}")
