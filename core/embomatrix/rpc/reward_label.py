@@ -43,8 +43,10 @@ class RewardLabel:
 def answer_in(query: str, prompt: str) -> str:
     """Return the text after the prompt; tokenizers may have inserted text before it. Raises InvalidRequestError.
 
-    The prompt shows an example plan, which must not be parsed as the answer.
+    The prompt shows an example plan, which must not be parsed as the answer. An empty prompt precedes any answer.
     """
+    if not prompt:
+        return query
     _, found, answer = query.partition(prompt)
     if not found:
         raise InvalidRequestError(
