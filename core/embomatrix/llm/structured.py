@@ -15,7 +15,7 @@ T = TypeVar("T", bound=BaseModel)
 MAX_STARTS: Final = 256
 """Most brackets at which the reader looks for JSON: bounds the work on adversarial text."""
 SHOWN_PROBLEMS: Final = 5
-_FENCE: Final = re.compile(r"```(?:json)?\s*\n(.*?)```", re.DOTALL)
+_FENCE: Final = re.compile(r"```(?:json)?[^\S\n]*\n(.*?)```", re.DOTALL)
 _BRACKET: Final = re.compile(r"[{\[]")
 
 

@@ -24,6 +24,8 @@ from embomatrix.rpc.versions import capabilities_of
 FIRST_CONTACT_S: Final = 10.0
 """Time limit for the handshake and the first answer of a manager with an unknown certificate."""
 _TOKEN: Final = re.compile(r"([0-9A-Za-z_-]+\.[0-9A-Za-z_-]+)(?:\.([0-9a-f]{64}))?")
+_CERTIFICATE_CHARS: Final = 16_384
+"""Characters in which a certificate is looked for. One has about 1,000."""
 _CERTIFICATE: Final = re.compile(
     r"-----BEGIN CERTIFICATE-----\s.+?\s-----END CERTIFICATE-----", re.DOTALL | re.ASCII
 )
@@ -62,7 +64,7 @@ def read_ca(path: Path | None) -> bytes:
 
 def fingerprint_of(pem: str) -> str:
     """Return the SHA-256 of the first certificate in the text, as hexadecimal digits. Raises ValueError without one."""
-    found = _CERTIFICATE.search(pem)
+    found = _CERTIFICATE.search(pem[:_CERTIFICATE_CHARS])
     if found is None:
         raise ValueError("there is no certificate in it")
     return hashlib.sha256(ssl.PEM_cert_to_DER_cert(found[0])).hexdigest()

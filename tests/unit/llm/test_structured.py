@@ -1,6 +1,7 @@
 """Typed answers are found in any text, and problems are reported to the model."""
 
 import json
+import time
 
 import pytest
 from hypothesis import given
@@ -62,6 +63,14 @@ def test_value_is_found_anywhere_in_the_text(text):
 def test_problems_are_reported_by_field(text, sentence):
     with pytest.raises(ValueError, match=sentence):
         read_json(text, Person)
+
+
+@pytest.mark.parametrize("text", ["```" + "\n" * 300_000, "```\n" * 50_000 + "```" + " " * 300_000])
+def test_fences_that_never_close_are_read_in_linear_time(text):
+    began_s = time.process_time()
+    with pytest.raises(ValueError, match="no complete JSON value"):
+        read_json(text, Person)
+    assert time.process_time() - began_s < 5.0
 
 
 @given(st.text())

@@ -1,5 +1,6 @@
 """Required protection at start, and the files of `manager init`."""
 
+import time
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -135,6 +136,13 @@ def test_invitation_round_trips_and_errors_hide_the_token(tmp_path):
         with pytest.raises(InvalidRequestError, match="expected TOKEN@HOST:PORT") as caught:
             Invitation.parse(wrong)
         assert "secret" not in str(caught.value)
+
+
+def test_text_of_many_unfinished_certificates_is_given_up_soon():
+    began_s = time.process_time()
+    with pytest.raises(ValueError, match="no certificate"):
+        fingerprint_of("-----BEGIN CERTIFICATE-----\n" * 100_000)
+    assert time.process_time() - began_s < 2.0
 
 
 def test_files_that_hold_no_token_or_certificate_are_named(tmp_path):

@@ -134,7 +134,7 @@ gripper, its shirt is spread out, its package has no lid, and its alarm clock ha
 """
 LAMPS: Final[Mapping[str, tuple[str, ...]]] = {"room_light.n.01": ("floor_lamp.n.01",)}
 """Replacement for lights that are switched. Ceiling lights have no switch in the catalog and are out of reach."""
-_TYPE: Final = re.compile(r"(?<![\w.])([a-z_\-]+\.n\.\d+)(?![\d_])", re.IGNORECASE)
+_TYPE: Final = re.compile(r"(?<![\w.\-])([a-z_\-]+\.n\.\d+)(?![\d_])", re.IGNORECASE)
 _SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IGNORECASE)
 
 
