@@ -51,7 +51,7 @@ def read_config(path: Path, refuse: Callable[[str], NoReturn]) -> dict[str, Any]
         return tomllib.loads(path.expanduser().read_text(encoding="utf-8"))
     except OSError as error:
         refuse(f"--config {path}: the file can't be read ({error.strerror or error}): name a TOML file")
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         refuse(f"--config {path}: {error}: expected a TOML file")
 
 

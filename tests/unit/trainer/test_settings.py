@@ -29,6 +29,7 @@ def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
         ("[reward]\ngoal = 'much'", r"setting 'reward\.goal': input should be a valid number"),
         ("grpo = 3", r"setting 'grpo': expected a table of settings \(found 3\)"),
         ("[grpo", r"settings\.toml is not valid TOML"),
+        ("a = " + "[" * 5_000, r"settings\.toml is not valid TOML \(.*recursion"),
     ],
 )
 def test_invalid_settings_are_rejected(tmp_path, content, sentence):

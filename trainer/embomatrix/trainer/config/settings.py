@@ -289,7 +289,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise TrainerError(
             f"the settings file {path} can't be read ({error.strerror}): expected a TOML file"
         ) from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise TrainerError(f"the settings file {path} is not valid TOML ({error}): fix the file") from error
 
 
