@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, NoReturn
 
-from embomatrix.world.evaluate import atoms_of, render
+from embomatrix.world.evaluate import GoalError, atoms_of, check_size, render
 from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified, Quantifier
 from embomatrix.world.state import THERMAL, SubstanceRelation
 from embomatrix.world.substances import is_substance
@@ -84,11 +84,11 @@ class BddlProblem:
     @property
     def types(self) -> Mapping[str, tuple[str, ...]]:
         """Object names by type, without wildcards: the range of quantifiers."""
-        members: dict[str, tuple[str, ...]] = dict.fromkeys(self.objects.values(), ())
+        members: dict[str, list[str]] = {type_name: [] for type_name in self.objects.values()}
         for name, type_name in self.objects.items():
             if not name.endswith(WILDCARD):
-                members[type_name] = (*members[type_name], name)
-        return members
+                members[type_name].append(name)
+        return {type_name: tuple(names) for type_name, names in members.items()}
 
     @property
     def wildcards(self) -> Mapping[str, str]:
@@ -156,18 +156,23 @@ def parse_problem(text: str) -> BddlProblem:
     if name_node is root or len(name_node.items) != 2 or not name_node.items[1].word:
         name_node.fail("expected (problem NAME), one word")
     objects = _parse_objects(sections[":objects"])
-    reader = _Reader(objects)
-    return BddlProblem(
+    reader = _Reader(objects, frozenset(objects.values()))
+    problem = BddlProblem(
         name=name_node.items[1].word,
         objects=objects,
         init=tuple(reader.literal(node) for node in sections[":init"].items[1:]),
         goal=reader.goal(sections[":goal"]),
     )
+    try:
+        check_size(problem.goal, problem.types)
+    except GoalError as error:
+        sections[":goal"].fail(str(error))
+    return problem
 
 
 def parse_formula(text: str, objects: Mapping[str, str]) -> Formula:
     """Read one formula over ``objects`` (name to type). Raises BddlError."""
-    return _Reader(objects).formula(_read(text), {})
+    return _Reader(objects, frozenset(objects.values())).formula(_read(text), {})
 
 
 def is_room_instance(name: str) -> bool:
@@ -249,9 +254,10 @@ def _parse_objects(section: _Node) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _Reader:
-    """Formulas over declared objects. ``scope`` maps a bound variable to its type."""
+    """Formulas over declared objects of these types. ``scope`` maps a bound variable to its type."""
 
     objects: Mapping[str, str]
+    types: frozenset[str]
 
     def literal(self, node: _Node) -> InitLiteral:
         if node.head == "not" and not node.word:
@@ -299,8 +305,8 @@ class _Reader:
         words = [item.word.lower() for item in node.items]
         if len(words) != 3 or words[1] != "-" or not words[0].startswith("?") or not words[2]:
             node.fail("expected a variable and its type: (?NAME - TYPE)")
-        if words[2] not in self.objects.values():
-            known = ", ".join(sorted(set(self.objects.values()))) or "none"
+        if words[2] not in self.types:
+            known = ", ".join(sorted(self.types)) or "none"
             node.items[2].fail(f"unknown type {words[2]!r}: the types in :objects are {known}")
         return words[0], words[2]
 

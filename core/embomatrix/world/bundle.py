@@ -33,13 +33,15 @@ from embomatrix.world.poses import PoseCache
 from embomatrix.world.records import PosesJson, Record, SceneInvalidError, SceneJson, TaskJson, decode
 from embomatrix.world.scene import Scene
 from embomatrix.world.tables import Tables, TableWriter
-from embomatrix.world.task import Task
+from embomatrix.world.task import MAX_TASKS, Task
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
 _ALIGNMENT: Final = 8
 _DTYPES: Final[Mapping[str, np.dtype[Any]]] = {name: np.dtype(name) for name in ("<f8", "<i4", "|u1")}
 _PREPARED: Final = "prepared."
+MAX_ARRAYS: Final = 1_000
+"""Arrays of a bundle; a scene needs about twenty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +62,11 @@ class BundleJson(Record):
     """Head of a bundle. ``arrays`` lists the dtype and the shape of each array."""
 
     scene: SceneJson
-    tasks: list[TaskJson]
+    tasks: Annotated[list[TaskJson], Meta(max_length=MAX_TASKS)]
     poses: PosesJson
-    arrays: dict[str, Annotated[list[str | int], Meta(min_length=2, max_length=5)]]
+    arrays: Annotated[
+        dict[str, Annotated[list[str | int], Meta(min_length=2, max_length=5)]], Meta(max_length=MAX_ARRAYS)
+    ]
 
 
 def encode_bundle(bundle: Bundle) -> bytes:

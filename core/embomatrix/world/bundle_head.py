@@ -2,12 +2,13 @@
 
 import struct
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
+from msgspec import Meta
 
 from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError, BundleLimits, check_values, decompress
-from embomatrix.world.task import Profile
+from embomatrix.world.task import MAX_NAME, MAX_TASKS, Profile
 
 FORMAT: Final = 3
 MAGIC: Final = b"EMBX"
@@ -16,12 +17,12 @@ HEAD: Final = struct.Struct("<4sII")
 
 
 class _TaskHead(msgspec.Struct):
-    task_id: str
+    task_id: Annotated[str, Meta(max_length=MAX_NAME)]
     profile: Profile = Profile.PAPER
 
 
 class _TasksOfBundle(msgspec.Struct):
-    tasks: list[_TaskHead]
+    tasks: Annotated[list[_TaskHead], Meta(max_length=MAX_TASKS)]
 
 
 def read_profiles(path: Path, *, limits: BundleLimits = DEFAULT_LIMITS) -> dict[str, Profile]:

@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from embomatrix.world.bddl import BddlError, parse_formula
-from embomatrix.world.evaluate import GoalError, count_scored_atoms, objects_of
+from embomatrix.world.evaluate import GoalError, check_size, objects_of, scored_atoms
 from embomatrix.world.placements import flattened
 from embomatrix.world.poses import PoseCache
 from embomatrix.world.records import PosesJson, SceneInvalidError, TaskJson
 from embomatrix.world.state import Relation
 from embomatrix.world.tables import Tables, TableWriter
-from embomatrix.world.task import MAX_ATOMS, Profile, Task
+from embomatrix.world.task import Profile, Task
 
 Json = dict[str, Any]
 
@@ -40,11 +40,11 @@ def task_of(record: TaskJson, path: str) -> Task:
     try:
         goal = parse_formula(record.goal, {**dict.fromkeys(record.table, ""), **members})
         missing = objects_of(goal, record.types) - set(record.table)
-        atoms = count_scored_atoms(goal, record.types)
+        check_size(goal, record.types)
     except (BddlError, GoalError) as error:
         raise SceneInvalidError(f"{path}.goal", str(error)) from error
-    if not 1 <= atoms <= MAX_ATOMS:
-        raise SceneInvalidError(f"{path}.goal", f"has {atoms:,} scored atoms: expected 1 to {MAX_ATOMS:,}")
+    if not scored_atoms(goal, record.types):
+        raise SceneInvalidError(f"{path}.goal", "has no scored atom, so it holds whatever the robot does: expected one")
     if missing:
         raise SceneInvalidError(f"{path}.goal", f"names {min(missing)!r}, which is not in the object table")
     return Task(

@@ -20,7 +20,7 @@ from embomatrix.world.codec_task import task_of, task_to_json
 from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError
 from embomatrix.world.intent import IntentClause
 from embomatrix.world.json_text import parse_json
-from embomatrix.world.records import Record, SceneInvalidError, TaskJson, convert
+from embomatrix.world.records import Record, SceneInvalidError, TaskJson, Text, convert
 from embomatrix.world.task import Task
 from embomatrix.world.whole_file import read_whole, write_whole
 
@@ -188,7 +188,7 @@ class TaskRecordJson(Record):
     split: Literal["train", "heldout"]
     oracle: tuple[dict[str, Any], ...]
     rooms: tuple[str, ...]
-    signature: str
+    signature: Text
     intent: tuple[IntentJson, ...] = ()
 
 

@@ -5,12 +5,18 @@ tests compare with its evaluator.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping
+from typing import Final
 
 from embomatrix.world.goal import And, Atom, Compound, Facts, Formula, Imply, Not, Or, Quantified, Quantifier
 from embomatrix.world.substances import is_substance
 
 Types = Mapping[str, tuple[str, ...]]
+MAX_GROUND: Final = 4_096
+"""Atoms of a goal after grounding its quantifiers. The largest goal of BEHAVIOR-1K has 124."""
+MAX_ATOMS: Final = 1_024
+"""Scored atoms of a goal, which every result lists."""
 
 
 class GoalError(ValueError):
@@ -99,15 +105,35 @@ def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
             return (formula,)
 
 
-def count_scored_atoms(formula: Formula, types: Types) -> int:
-    """Number of scored sub-goals. Makes none of them: nested quantifiers may have more than fit in memory."""
+def ground_size(formula: Formula, types: Types) -> int:
+    """Return the number of atoms after grounding every quantifier, without grounding any. Raises GoalError.
+
+    A part without an atom counts as one: copies of it need memory too.
+    """
     match formula:
-        case And(parts):
-            return sum(count_scored_atoms(part, types) for part in parts)
-        case Quantified(Quantifier.FORALL, ((_, type_name),), body):
-            return len(_members(type_name, types)) * count_scored_atoms(body, types)
-        case _:
+        case Atom():
             return 1
+        case And(parts) | Or(parts):
+            return max(1, sum(ground_size(part, types) for part in parts))
+        case Imply(premise, conclusion):
+            return ground_size(premise, types) + ground_size(conclusion, types)
+        case Not(body):
+            return ground_size(body, types)
+        case Quantified(_, binders, body):
+            members = math.prod(len(_members(type_name, types)) for _, type_name in binders)
+            return max(1, members * ground_size(body, types))
+
+
+def check_size(goal: Formula, types: Types) -> None:
+    """Raise GoalError for a goal that becomes too many atoms: nested quantifiers multiply."""
+    size = ground_size(goal, types)
+    if size > MAX_GROUND:
+        raise GoalError(
+            f"the goal becomes {size:,} atoms: expected at most {MAX_GROUND:,}; nest fewer quantifiers, or name fewer objects"
+        )
+    scored = len(scored_atoms(goal, types))
+    if scored > MAX_ATOMS:
+        raise GoalError(f"the goal has {scored:,} scored atoms: expected at most {MAX_ATOMS:,}")
 
 
 def expand(formula: Formula, types: Types) -> Atom | Not | And | Or | Quantified:

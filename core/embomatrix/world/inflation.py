@@ -1,4 +1,4 @@
-"""Limits on a bundle before it is trusted: its digest, its size and its growth in decompression.
+"""Limits on a bundle before it is trusted: its digest, its size, its growth in decompression, and its values.
 
 Services that only relay bundles need this module alone, without numpy.
 """
@@ -25,6 +25,8 @@ class BundleLimits:
     compressed_bytes: int = 8 * 1024 * 1024
     ratio: float = 100.0
     """Decompressed bytes per compressed byte; scenes need about ten."""
+    content_bytes: int = 16 * 1024 * 1024
+    """Decompressed bytes. The largest shipped bundle has 1.7 MB; each becomes up to four in memory."""
     values: int = 400_000
     """Values of its JSON text. The largest shipped bundle has 29,000; each becomes an object of some hundred bytes."""
 
@@ -63,7 +65,7 @@ class Inflation:
         self._taken += len(piece)
         if self._taken > self._limits.compressed_bytes:
             raise too_large(self._limits)
-        bound = int(self._taken * self._limits.ratio) + _CHUNK
+        bound = min(int(self._taken * self._limits.ratio) + _CHUNK, self._limits.content_bytes)
         try:
             content = self._decoder.decompress(piece, bound - self._grown + 1)
         except zlib.error as error:
@@ -72,7 +74,7 @@ class Inflation:
         if self._grown > bound or self._decoder.unconsumed_tail:
             raise BundleError(
                 f"the bundle grows beyond {bound:,} bytes in its first {self._taken:,}: expected at most "
-                f"{self._limits.ratio:g} to 1"
+                f"{self._limits.ratio:g} to 1, and {self._limits.content_bytes:,} in all"
             )
         return content
 
@@ -87,10 +89,11 @@ def too_large(limits: BundleLimits) -> BundleError:
 def check_values(text: bytes | memoryview, limits: BundleLimits) -> None:
     """Raise BundleError if the JSON text may hold too many values, before any of them becomes an object.
 
-    Each value but the first follows a comma or an opening bracket. Those inside texts are counted too.
+    Each value but the first follows a comma or an opening bracket. Those inside texts are counted too, and the parentheses
+    of goals, which are lists of their own.
     """
     content = bytes(text)
-    count = 1 + sum(map(content.count, (b",", b"[", b"{")))
+    count = 1 + sum(map(content.count, (b",", b"[", b"{", b"(")))
     if count > limits.values:
         raise BundleError(
             f"its JSON has up to {count:,} values: expected at most {limits.values:,}; split the scene or its tasks"

@@ -20,13 +20,12 @@ from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import Shape
 from embomatrix.world.poses import Handling
 from embomatrix.world.state import Relation, State, SubstanceRelation
-from embomatrix.world.task import MAX_TABLE, Profile, TaskCategory
+from embomatrix.world.task import MAX_NAME, MAX_TABLE, Profile, TaskCategory
 
 MIN_EXTENT_M: Final = 1e-3
 MAX_COORDINATE_M: Final = 1e4
 UNIT_TOLERANCE: Final = 1e-4
 """Largest deviation of a quaternion's or an axis's length from 1."""
-MAX_NAME: Final = 200
 MAX_VERTICES: Final = 512
 MAX_PARTS: Final = 16
 """Parts of a link. Bullet silently drops the rest of a compound shape."""
@@ -35,6 +34,8 @@ MAX_MASS_KG: Final = 1e6
 MAX_ROOMS: Final = 1_000
 MAX_WALLS: Final = 10_000
 MAX_OBJECTS: Final = 5_000
+MAX_TEXT: Final = 10_000
+"""Characters of an instruction or a goal. The longest goal of BEHAVIOR-1K has 1,800."""
 MAX_KEYS_SEARCHED: Final = 1_000
 """Limit on the search for the key of an invalid value in a mapping."""
 
@@ -47,6 +48,7 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Row = Annotated[int, Meta(ge=0)]
 Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME, pattern=rf"^[^/\\{_UNPRINTABLE}]*\Z")]
 """Printable text without a slash, safe as a part of a file name."""
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 Point = tuple[Number, Number, Number]
 Extents = tuple[Extent, Extent, Extent]
 # A row has no bound here: msgspec 0.22 crashes on the union of a fixed tuple and an int with bounds. ``tables`` checks it.
@@ -228,9 +230,9 @@ class SceneJson(Record):
 class TaskJson(Record):
     task_id: Name
     scene_id: Name
-    instruction: str
+    instruction: Text
     category: TaskCategory
-    goal: str
+    goal: Text
     table: Annotated[tuple[Name, ...], Meta(max_length=MAX_TABLE)]
     types: dict[str, tuple[str, ...]]
     source: str

@@ -28,6 +28,8 @@ Arrays = Mapping[str, NDArray[np.generic]]
 T = TypeVar("T")
 
 MIN_SPREAD_M: Final = 5e-5
+MAX_ROWS: Final = 100_000
+"""Rows of all arrays whose rows become objects. The largest shipped bundle has 6,000."""
 FLAT_HULL: Final = (
     "the hull's vertices lie in one point, on a line or in a plane: expected a body; give it thickness"
 )
@@ -93,13 +95,20 @@ class Tables:
         poses = _floats(arrays, "poses", POSE_NUMBERS)
         parts = _floats(arrays, "parts", POSE_NUMBERS + 3)
         vertices = _floats(arrays, "vertices", 3)
+        stands = _floats(arrays, "stands", 3)
+        rows = len(poses) + len(parts) + len(vertices) + len(stands)
+        if rows > MAX_ROWS:
+            raise SceneInvalidError(
+                "tables",
+                f"have {rows:,} poses, parts, vertices and standing poses: expected at most {MAX_ROWS:,}",
+            )
         _check_poses("poses", poses)
         _check_poses("parts", parts[:, :POSE_NUMBERS])
         sizes = parts[:, POSE_NUMBERS:]
         _check_rows("parts", sizes, sizes.min(axis=1, initial=1) > MIN_EXTENT_M, "an extent of 1 mm or less")
         _check_rows("parts", sizes, sizes.max(axis=1, initial=1) <= MAX_COORDINATE_M, "an extent above 10 km")
         self._poses = [Pose((x, y, z), (a, b, c, d)) for x, y, z, a, b, c, d in poses.tolist()]
-        self._stands = _floats(arrays, "stands", 3)
+        self._stands = stands
         self._spots = _floats(arrays, "spots", POSE_NUMBERS)
         _check_poses("spots", self._spots)
         self._sets = _sets(arrays)

@@ -9,8 +9,10 @@ from typing import Final
 from embomatrix.world.evaluate import objects_of, render, scored_atoms
 from embomatrix.world.goal import Formula
 
-MAX_ATOMS: Final = 1_024
-"""Largest number of scored atoms of a goal. There is at least one: an empty goal holds whatever the robot does."""
+MAX_NAME: Final = 200
+"""Characters of the name of a task, a scene, an object or a room."""
+MAX_TASKS: Final = 1_000
+"""Tasks of one bundle."""
 MAX_TABLE: Final = 60
 """Largest number of rows in a task's object table: more do not fit a prompt."""
 

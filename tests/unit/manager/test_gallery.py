@@ -1,12 +1,15 @@
 """Dataset pages of the dashboard, and their file access limits."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+from tests.fakes.tiny_scene import tiny_task
+from tests.fuzz.worst_bundle import bundle_with
 
 from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.manager.web.gallery import Gallery
@@ -124,6 +127,25 @@ async def test_missing_or_damaged_dataset_is_reported(folder, tmp_path):
     (folder / "tasks.jsonl").write_text("{}\n")
     with pytest.raises(UnavailableError, match=r"tasks\.jsonl:1 is damaged"):
         await gallery.page(**EVERY)
+
+
+async def test_memory_of_a_dataset_with_hostile_bundles_is_bounded(tmp_path):
+    bundles = [bundle_with({"abilities": 98_304 - number, "characters": 14_900_000}) for number in range(3)]
+    records = [
+        TaskRecord(replace(tiny_task(), task_id=f"t{number}"), bundle_digest(data), "train", (), (), "")
+        for number, data in enumerate(bundles)
+    ]
+    write_dataset(tmp_path, records, {bundle_digest(data): data for data in bundles})
+    del bundles
+    gallery = Gallery(tmp_path)
+    tracemalloc.start()
+    try:
+        for record in records:
+            assert (await gallery.detail(record.task.task_id)).floor.rooms
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 200e6
 
 
 def test_plan_moves_picked_objects_to_their_targets():

@@ -2,8 +2,9 @@
 
 import pytest
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+from tests.fuzz.worst_bundle import bundle_with
 
-from embomatrix.manager.runtime.bundles import BundleStore
+from embomatrix.manager.runtime.bundles import TASKS_KEPT, BundleStore
 from embomatrix.manager.runtime.runs import check_plans
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.wire.values import Batch, Rollout
@@ -36,6 +37,17 @@ def batch(task_id, plan, digest=DIGEST):
 async def test_a_bundle_tells_the_tasks_and_profiles_that_it_was_encoded_with(store):
     expected = {task_id: task.profile for task_id, task in TASKS.items()}
     assert await store.profiles([DIGEST]) == {DIGEST: expected}
+
+
+async def test_tasks_of_the_oldest_bundles_are_forgotten_for_newer_ones(store, tmp_path):
+    names = [f"{number:064x}" for number in range(120)]
+    bundles = bundle_with({"tasks": 900})
+    for name in names:
+        (tmp_path / f"{name}.bundle").write_bytes(bundles)
+    for name in names:
+        assert len((await store.profiles([f"sha256:{name}"]))[f"sha256:{name}"]) == 901
+    assert sum(map(len, store._profiles.values())) <= TASKS_KEPT
+    assert f"sha256:{names[-1]}" in store._profiles
 
 
 @pytest.mark.parametrize(

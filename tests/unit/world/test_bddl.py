@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -170,6 +171,20 @@ def test_error_names_the_line(name: str) -> None:
     assert message in str(caught.value)
     assert caught.value.line == line
     assert str(caught.value).startswith(f"line {line}, column {caught.value.column}:")
+
+
+def test_goal_whose_quantifiers_multiply_is_refused() -> None:
+    nested = "(forall (?a - apple.n.01) " * 40 + "(cooked ?a)" + ")" * 40
+    with pytest.raises(BddlError, match=r"line 1, column \d+: the goal becomes 1,099,511,627,776 atoms"):
+        parse_problem(f"(define (problem x) (:objects a b - apple.n.01) (:init ) (:goal {nested}))")
+
+
+def test_problem_of_many_objects_is_read_in_linear_time() -> None:
+    began_s = time.process_time()
+    names = " ".join(f"a{number}" for number in range(100_000))
+    problem = parse_problem(f"(define (problem x) (:objects {names} - apple) (:init ) (:goal (hot a1)))")
+    assert len(problem.types["apple"]) == 100_000
+    assert time.process_time() - began_s < 10.0
 
 
 def test_column_points_at_the_word() -> None:

@@ -84,13 +84,11 @@ def test_bundle_of_the_first_format_names_the_remedy() -> None:
         decode_bundle(zlib.compress(b'{"format":1,"scene":{}}'))
 
 
-@pytest.mark.parametrize(
-    ("goal", "atoms"), [("(and)", "0"), ("(and (and) (and))", "0"), ("(forall (?x - apple.n.01) (and))", "0")]
-)
-def test_goal_without_an_atom_is_refused(bundle: Bundle, task: Task, goal: str, atoms: str) -> None:
+@pytest.mark.parametrize("goal", ["(and)", "(and (and) (and))", "(forall (?x - apple.n.01) (and))"])
+def test_goal_without_an_atom_is_refused(bundle: Bundle, task: Task, goal: str) -> None:
     """It holds whatever the robot does, and no result of it agrees with its atoms."""
     vacuous = dataclasses.replace(task, goal_bddl=goal)
-    with pytest.raises(BundleError, match=rf"goal: has {atoms} scored atoms: expected 1 to 1,024"):
+    with pytest.raises(BundleError, match="goal: has no scored atom, .* expected one"):
         decode_bundle(encode_bundle(dataclasses.replace(bundle, tasks={task.task_id: vacuous})))
 
 

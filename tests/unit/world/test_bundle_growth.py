@@ -1,4 +1,4 @@
-"""Bundles whose JSON would become far more memory than its bytes."""
+"""Bundles whose JSON and arrays would become far more memory than their bytes."""
 
 import json
 import struct
@@ -8,6 +8,7 @@ import zlib
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.fuzz.worst_bundle import KINDS, bundle_with, measured, worst
 
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.bundle_head import FORMAT, MAGIC
@@ -16,7 +17,7 @@ from embomatrix.world.inflation import BundleError, BundleLimits, check_values
 MOST_MB = 200
 
 
-def bundle_with(text):
+def bundle_of(text):
     """Return a bundle with this JSON text and no arrays."""
     head = struct.calcsize("<4sII")
     text += b" " * (-(head + len(text)) % 64)
@@ -29,7 +30,7 @@ def bundle_with(text):
 @pytest.mark.parametrize("field", [b"tasks", b"arrays", b"poses", b"anything"])
 def test_memory_of_a_hostile_bundle_is_bounded(value, field):
     count = 8_000_000 // (len(value) + 1)
-    data = bundle_with(b'{"%s":[' % field + b",".join([value] * count) + b"]}")
+    data = bundle_of(b'{"%s":[' % field + b",".join([value] * count) + b"]}")
     tracemalloc.start()
     try:
         with pytest.raises(BundleError, match=r"values: expected at most 400,000|grows beyond"):
@@ -38,6 +39,38 @@ def test_memory_of_a_hostile_bundle_is_bounded(value, field):
     finally:
         tracemalloc.stop()
     assert peak_mb < MOST_MB
+
+
+@pytest.mark.parametrize(
+    "mixture",
+    [
+        {"poses": 1_000_000},
+        {"boxes": 400_000},
+        {"one goal": 300_000},
+        {"characters": 60_000_000},
+        {"described arrays": 130_000},
+        # the worst that `tests.fuzz.worst_bundle` found within the limits
+        {"abilities": 98_304, "characters": 14_900_000},
+        {"barred": 98_304, "boxes": 98_304},
+    ],
+    ids=lambda mixture: " and ".join(mixture),
+)
+def test_memory_of_a_bundle_with_very_many_elements_is_bounded(mixture):
+    assert measured(mixture).peak_mb < MOST_MB
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_search_for_the_worst_bundle_adds_elements_of_every_kind(kind):
+    assert measured({kind: 50}).accepted
+    assert len(bundle_with({kind: 50})) > len(bundle_with({}))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_memory_of_the_worst_bundle_that_a_search_finds_is_bounded():
+    found = worst(6)
+    assert found.accepted
+    assert found.peak_mb < MOST_MB, found
 
 
 @given(

@@ -11,8 +11,9 @@ from embomatrix.world.bddl import parse_formula
 from embomatrix.world.evaluate import (
     GoalError,
     atoms_of,
-    count_scored_atoms,
+    check_size,
     evaluate,
+    ground_size,
     objects_of,
     render,
     scored_atoms,
@@ -103,16 +104,13 @@ def test_scored_atoms_are_conjuncts_after_grounding_and_other_operators_count_on
     ]
 
 
-@pytest.mark.parametrize("text", ["(and)", EVERY, PAIRS, f"(and {EVERY} (and {PAIRS} (or)) (hot lamp_1))"])
-def test_scored_atoms_are_counted(text: str) -> None:
-    assert count_scored_atoms(goal(text), TYPES) == len(scored_atoms(goal(text), TYPES))
-
-
-def test_atoms_of_nested_quantifiers_are_counted_without_making_them() -> None:
-    formula = goal("(open box_1)")
+@pytest.mark.parametrize("text", ["(or)", "(and)"])
+def test_nested_quantifiers_over_nothing_are_refused_before_they_are_grounded(text: str) -> None:
+    formula = goal(text)
     for number in range(40):
         formula = forall(f"?x{number}", "apple", formula)
-    assert count_scored_atoms(formula, TYPES) == 2**40
+    with pytest.raises(GoalError, match="1,099,511,627,776 atoms"):
+        check_size(formula, TYPES)
 
 
 def test_unknown_type_and_free_variable_are_named() -> None:
@@ -140,3 +138,24 @@ def test_conjunction_holds_exactly_when_all_its_scored_atoms_do(true: set[tuple[
     table = Table(true)
     parts = [evaluate(atom, table, TYPES) for atom in scored_atoms(formula, TYPES)]
     assert evaluate(formula, table, TYPES) is all(parts)
+
+
+def nested(depth: int, quantifier: str = "forall") -> Formula:
+    """Return a goal of this many quantifiers in each other."""
+    text = "(hot ?x0)"
+    for number in range(depth):
+        text = f"({quantifier} (?x{number} - apple) {text})"
+    return parse_formula(text, OBJECTS)
+
+
+@pytest.mark.parametrize("quantifier", ["forall", "exists"])
+def test_size_of_a_goal_is_known_without_grounding_it(quantifier):
+    assert ground_size(nested(3, quantifier), TYPES) == 2**3
+    with pytest.raises(GoalError, match=r"becomes 1,152,921,504,606,846,976 atoms: expected at most 4,096"):
+        check_size(nested(60, quantifier), TYPES)
+
+
+def test_goal_with_more_scored_atoms_than_a_result_may_list_is_refused():
+    check_size(nested(10), TYPES)
+    with pytest.raises(GoalError, match="2,048 scored atoms: expected at most 1,024"):
+        check_size(nested(11), TYPES)

@@ -19,7 +19,7 @@ from google.protobuf.message import DecodeError, Message
 
 from embomatrix.rpc.wire.codec import ConvertError, MessageT
 from embomatrix.skills.syntax import MAX_ROOM_NAME, MAX_STEPS
-from embomatrix.world.task import MAX_ATOMS
+from embomatrix.world.evaluate import MAX_ATOMS
 
 LARGEST_EPOCH: Final = 2.0**63
 NAME: Final = 256

@@ -24,8 +24,8 @@ logger = logging.getLogger(__name__)
 PREFIX: Final = "sha256:"
 INCOMING: Final = "incoming-"
 """Prefix of the names of incomplete files."""
-PROFILES_KEPT: Final = 1024
-"""Bundles whose tasks stay in memory. The oldest is forgotten first."""
+TASKS_KEPT: Final = 50_000
+"""Tasks of bundles that stay in memory, of less than 1 kB each. Those of the oldest bundle are forgotten first."""
 _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
 
 
@@ -50,6 +50,7 @@ class BundleStore:
         self._clock = clock
         self._needed: Callable[[], AbstractSet[str]] = frozenset
         self._profiles: dict[str, Mapping[str, Profile]] = {}
+        self._reading = asyncio.Lock()
         folder.mkdir(parents=True, exist_ok=True)
         for left_over in folder.glob(f"{INCOMING}*"):
             if clock() - left_over.stat().st_mtime > keep_s:
@@ -73,21 +74,30 @@ class BundleStore:
         return [digest for digest in dict.fromkeys(digests) if not self.has(digest)]
 
     async def profiles(self, digests: Iterable[str]) -> Mapping[str, Mapping[str, Profile]]:
-        """Return the tasks of the bundles that are present and readable: the profile of each by task id."""
+        """Return the tasks of the bundles that are present and readable: the profile of each by task id.
+
+        Bundles are read one at a time: each may take as much memory as three times its content.
+        """
         found = {}
         for digest in dict.fromkeys(digests):
-            tasks = self._profiles.get(digest)
-            if tasks is None:
-                try:
-                    tasks = await asyncio.to_thread(read_profiles, self._path(digest))
-                except (OSError, BundleError):
-                    # Absent bundles are reported by ``missing``, unreadable ones by the workers that load them.
-                    continue
-                while len(self._profiles) >= PROFILES_KEPT:
-                    del self._profiles[next(iter(self._profiles))]
-                self._profiles[digest] = tasks
-            found[digest] = tasks
+            # Absent bundles are reported by ``missing``, unreadable ones by the workers that load them.
+            with contextlib.suppress(OSError, BundleError):
+                found[digest] = await self._profiles_of(digest)
         return found
+
+    async def _profiles_of(self, digest: str) -> Mapping[str, Profile]:
+        if digest in self._profiles:
+            return self._profiles[digest]
+        async with self._reading:
+            if digest not in self._profiles:
+                self._keep_profiles(digest, await asyncio.to_thread(read_profiles, self._path(digest)))
+            return self._profiles[digest]
+
+    def _keep_profiles(self, digest: str, tasks: Mapping[str, Profile]) -> None:
+        kept = len(tasks) + sum(map(len, self._profiles.values()))
+        while self._profiles and kept > TASKS_KEPT:
+            kept -= len(self._profiles.pop(next(iter(self._profiles))))
+        self._profiles[digest] = tasks
 
     async def missing_or_damaged(self, digests: list[str]) -> list[str]:
         """Return the digests of bundles that are absent or damaged. Damaged files are deleted."""

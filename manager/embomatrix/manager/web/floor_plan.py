@@ -20,11 +20,12 @@ SMALL_M: Final = 0.2
 SKIRTING_M: Final = 0.1
 """Walls whose lower edge is above this height are lintels or panes: the plan shows an opening."""
 PIECES: Final = 1500
+"""Most walls, and most pieces of furniture, that are drawn."""
 
 
 def floor_plan(scene: Scene) -> FloorPlanView:
     """Return the plan of the whole scene."""
-    walls = [wall.aabb(IDENTITY) for wall in scene.walls]
+    walls = [wall.aabb(IDENTITY) for wall in scene.walls[:PIECES]]
     boxes = [(item, scene.box_of(item.name)) for item in scene.objects if not item.absent]
     pieces = [
         _box(item.name, box.low_m, box.high_m)

@@ -35,9 +35,8 @@ TASKS_BYTES: Final = 256_000_000
 NOTE_BYTES: Final = 262_144
 """Size limit of a transcript or a layout tree."""
 PICTURE_BYTES: Final = 2_000_000
-SCENES_KEPT: Final = 8
-"""Decoded scenes in memory, a few tens of MB."""
-PLANS_KEPT: Final = 256
+PLANS_KEPT: Final = 64
+"""Floor plans in memory, of less than 1 MB each."""
 PICTURES_FOLDER: Final = "pictures"
 HANGS_M: Final = 0.05
 """An object above this height without support hangs on a wall."""
@@ -54,7 +53,8 @@ class Gallery:
         self._stamp: tuple[int, int] | None = None
         self._records: dict[str, TaskRecord] = {}
         self._dataset: Dataset  # set with the stamp
-        self._scene = functools.lru_cache(SCENES_KEPT)(self._read_scene)
+        self._held: tuple[str, Scene] | None = None
+        """Scene that was read last, by its digest. A hostile one takes 100 MB, so there is only one."""
         self._floor = functools.lru_cache(PLANS_KEPT)(lambda digest: floor_plan(self._scene(digest)))
 
     async def page(self, *, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
@@ -130,7 +130,7 @@ class Gallery:
                 dataset = Dataset.load(self._folder)
                 self._dataset, self._stamp = dataset, (known.st_mtime_ns, known.st_size)
                 self._records = {record.task.task_id: record for record in dataset.records}
-                self._scene.cache_clear()
+                self._held = None
                 self._floor.cache_clear()
         except OSError as error:
             raise UnavailableError(
@@ -140,11 +140,16 @@ class Gallery:
             raise UnavailableError(str(error)) from error
         return self._records
 
-    def _read_scene(self, digest: str) -> Scene:
+    def _scene(self, digest: str) -> Scene:
+        if self._held is not None and self._held[0] == digest:
+            return self._held[1]
+        self._held = None  # frees its memory for the next one
         try:
-            return self._dataset.read_bundle(digest).scene
+            scene = self._dataset.read_bundle(digest).scene
         except DatasetError as error:
             raise UnavailableError(str(error)) from error
+        self._held = (digest, scene)
+        return scene
 
     def _read_detail(self, record: TaskRecord) -> TaskDetail:
         task, scene = record.task, self._scene(record.bundle_digest)
