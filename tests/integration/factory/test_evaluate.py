@@ -139,6 +139,16 @@ def test_hand_made_rooms_are_read_with_furniture_and_small_objects(tmp_path):
 def test_file_without_rooms_is_reported_in_a_sentence(tmp_path):
     with pytest.raises(EvaluationError, match="not a table of hand-made rooms"):
         read_rooms(_rooms_file(tmp_path / "rooms.json.gz", [{"kind": "bedrooms", "objects": [["Bed"]]}]))
+    whole = (tmp_path / "rooms.json.gz").read_bytes()
+    for damaged in (
+        whole[:-9],
+        whole[:20] + b"\xff" * 9 + whole[29:],
+        gzip.compress(b"3"),
+        gzip.compress(b"{"),
+    ):
+        (tmp_path / "rooms.json.gz").write_bytes(damaged)
+        with pytest.raises(EvaluationError, match="not a table of hand-made rooms"):
+            read_rooms(tmp_path / "rooms.json.gz")
 
 
 @given(st.lists(st.sampled_from("abc"), min_size=1, max_size=12))
@@ -200,9 +210,10 @@ def test_figures_are_read_back_equal(tmp_path):
     path = tmp_path / "tasks.json"
     path.write_text(json.dumps(evaluation_to_json(EVALUATION)))
     assert read_evaluation(path) == EVALUATION
-    path.write_text('{"part": "tasks"}')
-    with pytest.raises(EvaluationError, match="contains no figures"):
-        read_evaluation(path)
+    for damaged in ('{"part": "tasks"}', path.read_text().replace('"n": 450', '"n": 1e999'), "[" * 5_000):
+        path.write_text(damaged)
+        with pytest.raises(EvaluationError, match="contains no figures"):
+            read_evaluation(path)
 
 
 def test_page_keeps_everything_outside_the_factory_section():
@@ -248,14 +259,16 @@ def test_page_without_an_end_marker_is_rejected():
 def test_ledger_gives_the_admitted_share(tmp_path):
     assert admitted_share(tmp_path) == ()
     ledger = tmp_path / "attempts.jsonl"
+    draft = {"split": "train", "variant": 0, "scene": "Rs_int-train-000"}
     ledger.write_text(
-        "".join(json.dumps({"outcome": outcome}) + "\n" for outcome in ("admitted", "no_plan") * 2)
+        "".join(json.dumps({**draft, "outcome": outcome}) + "\n" for outcome in ("admitted", "no_plan") * 2)
     )
     (figure,) = admitted_share(tmp_path)
     assert (figure.value, figure.n, figure.is_reached) == (50.0, 4, False)
-    ledger.write_text('{"outcome": "admitted"}\n{"outc')
-    with pytest.raises(EvaluationError, match="can't be read as a ledger"):
-        admitted_share(tmp_path)
+    for damaged in (b'{"outcome": "admitted"}', b'{"outc', b"\xff", b"[" * 5_000):
+        ledger.write_bytes(json.dumps({**draft, "outcome": "admitted"}).encode() + b"\n" + damaged)
+        with pytest.raises(EvaluationError, match="can't be read as a ledger"):
+            admitted_share(tmp_path)
 
 
 def a_build(folder, writer, times):
@@ -278,8 +291,9 @@ def test_admission_rate_uses_recorded_times_of_variants_and_base_scenes(tmp_path
         {"base_scenes": 1, "cpu_s": 1.0},
     ]
     a_build(tmp_path, "social", known)
-    with (tmp_path / "times.jsonl").open("a") as file:
-        file.write('{"split": "train", "vari')
+    with (tmp_path / "times.jsonl").open("ab") as file:
+        file.write(b'{"cpu_s": NaN, "variant": 1}\n{"split": [], "variant": 2, "cpu_s": 1e400}\n\xff\n')
+        file.write(b'{"split": "train", "vari')
     found = evaluate_admissions(tmp_path)
     assert found.figure("admitted_share").value == 75.0
     pace = found.figure("admitted_per_hour")

@@ -157,6 +157,17 @@ def test_glb_is_read_with_the_poses_of_its_nodes(tmp_path: Path) -> None:
     assert top.center_m[2] == pytest.approx(asset.size_m[2] / 2, abs=0.03)
 
 
+def test_glb_whose_faces_name_vertices_that_it_lacks_is_refused(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    data = bytearray(box.export(file_type="glb"))
+    at = data.index(box.faces.astype("<u4").tobytes())
+    data[at : at + 4] = (300).to_bytes(4, "little")
+    path = tmp_path / "a.glb"
+    path.write_bytes(data)
+    with pytest.raises(ModelFileError, match="a face names a vertex outside"):
+        imported(path, "carton")
+
+
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [

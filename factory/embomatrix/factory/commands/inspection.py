@@ -1,8 +1,7 @@
 """``embomatrix factory inspect`` and ``pictures``: HTML page of a task, pictures of a dataset's scenes."""
 
-import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -11,6 +10,7 @@ from embomatrix.factory.inspection.page import scene_jpeg, scene_picture, task_p
 from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
 from embomatrix.world.dataset import Dataset, bundle_file
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import check_writable, write_whole
 
 PICTURES_FOLDER = "pictures"
@@ -39,7 +39,7 @@ def inspect(
             bundle.scene,
             play_oracle(record, bundle),
             transcript,
-            json.loads(tree) if tree else None,
+            _tree_in(tree),
             scene_picture(bundle.scene) if picture else "",
         )
         write_whole(file, page.encode("utf-8"))
@@ -63,6 +63,14 @@ def pictures(
             for digest, file in bars.track(missing.items(), description="pictures"):
                 write_whole(file, scene_jpeg(loaded.read_bundle(digest).scene, CARD_PX))
     say(f"{len(missing)} pictures: {folder}")
+
+
+def _tree_in(text: str) -> Any:
+    """Return a layout tree; None for text that is none."""
+    try:
+        return parse_json(text) if text else None
+    except ValueError:
+        return None
 
 
 def _text(path: Path) -> str:

@@ -17,6 +17,8 @@ GOAL_PER_HOUR: Final = 1000.0
 CORES: Final = 2
 """Number of otherwise idle cores that the goal refers to."""
 ADMITTED: Final = "admitted"
+LONGEST_S: Final = 1e9
+"""CPU time of one variant beyond which a record is damaged."""
 
 
 def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
@@ -57,7 +59,9 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
 def _per_hour(folder: Path, attempts: Sequence[dict[str, Any]], label: str) -> tuple[Figure, ...]:
     """Return the admitted tasks per hour on two cores, by CPU time. Variants without a recorded time are left out."""
     lines = list(_times(folder / TIMES_FILE))
-    timed = {(line["split"], line["variant"]) for line in lines if "variant" in line}
+    timed = {
+        (str(line.get("split")), line["variant"]) for line in lines if isinstance(line.get("variant"), int)
+    }
     spent_s = sum(line["cpu_s"] for line in lines)
     admitted = sum(
         each["outcome"] == ADMITTED and (each["split"], each["variant"]) in timed for each in attempts
@@ -72,12 +76,16 @@ def _times(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the records of CPU time. A truncated line is skipped: its work was repeated."""
     if not path.is_file():
         return
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in path.read_bytes().splitlines():
         try:
             value = parse_json(line)
         except ValueError:
             continue
-        if isinstance(value, dict) and isinstance(value.get("cpu_s"), int | float):
+        if (
+            isinstance(value, dict)
+            and isinstance(value.get("cpu_s"), float)
+            and 0 <= value["cpu_s"] < LONGEST_S
+        ):
             yield value
 
 
@@ -86,12 +94,16 @@ def _attempts(folder: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     try:
-        lines = [parse_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        return [{**line, "outcome": line["outcome"]} for line in lines]
-    except (OSError, ValueError, LookupError, TypeError) as error:
+        return [_attempt(parse_json(line)) for line in path.read_bytes().splitlines()]
+    except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
         raise EvaluationError(
             f"{path} can't be read as a ledger ({error}): run the build again to rewrite it"
         ) from error
+
+
+def _attempt(line: Any) -> dict[str, Any]:
+    texts = {name: str(line[name]) for name in ("split", "scene", "outcome")}
+    return {**texts, "variant": int(line["variant"])}
 
 
 def _figure(name: str, label: str, value: float, unit: str, n: int, goal: float) -> Figure:

@@ -3,6 +3,7 @@
 import gzip
 import math
 import re
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,12 @@ from embomatrix.world.json_text import parse_json
 from embomatrix.world.scene import Scene
 
 FLOOR: Final = "floor"
+MAX_CHARS: Final = 64 * 1024 * 1024
+"""Characters of a table of rooms; that of iTHOR and RoboTHOR has 0.7 million."""
+DAMAGE: Final = (
+    OSError, EOFError, zlib.error, ValueError, TypeError, LookupError, AttributeError, OverflowError,
+)  # fmt: skip
+"""Errors of reading a damaged table."""
 MIN_PIECE_M: Final = 0.25
 """Least horizontal extent of furniture among objects on the floor."""
 STANDS_M: Final = 0.2
@@ -117,9 +124,9 @@ def read_rooms(path: Path) -> list[RoomPlan]:
     """Read the hand-made rooms of iTHOR and RoboTHOR from the table described in `docs/tasks.md`. Raises EvaluationError."""
     try:
         with gzip.open(path, "rt", encoding="utf-8") as file:
-            value = parse_json(file.read())
+            value = parse_json(file.read(MAX_CHARS + 1))
         return [_room_from(room, number) for number, room in enumerate(value["rooms"])]
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except DAMAGE as error:
         raise EvaluationError(
             f"{path} is not a table of hand-made rooms ({error}): expected gzipped JSON with 'rooms' and their 'objects'"
         ) from error

@@ -89,7 +89,8 @@ def _binary(data: bytes, kind: str, path: Path) -> Mapping[str, Mesh]:
 def _cut(points: FloatArray, faces: IntArray, path: Path) -> Mesh:
     """Return the mesh of some faces with only the vertices that they use."""
     try:
-        used, index = np.unique(faces, return_inverse=True)
+        whole = Mesh(points, faces)
+        used, index = np.unique(whole.faces, return_inverse=True)
         return Mesh(points[used], index.reshape(faces.shape))
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from None

@@ -61,7 +61,7 @@ def read_evaluation(path: Path) -> EvaluationFigures:
             tuple(figure_from_json(item) for item in value["figures"]),
             tuple(map(str, value["notes"])),
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise EvaluationError(
             f"{path} contains no figures of an evaluation ({error}): expected a file that `embomatrix factory "
             "evaluate`, `import` or `verify` wrote"

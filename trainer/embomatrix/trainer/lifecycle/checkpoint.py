@@ -14,6 +14,7 @@ import torch
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.protocol import Policy
+from embomatrix.trainer.policy.tensor_file import read_tensors
 from embomatrix.world.json_text import parse_json
 
 SCHEMA = 3
@@ -152,7 +153,7 @@ def read_state(folder: Path) -> tuple[TrainingProgress, TrainSettings]:
 def restore(folder: Path, load: Callable[[dict[str, Any]], object]) -> None:
     """Pass the saved tensors (without the policy) to ``load``. Raises TrainerError if they are damaged."""
     try:
-        load(torch.load(folder / _TENSORS, map_location="cpu", weights_only=True))
+        load(read_tensors(folder / _TENSORS))
     except DAMAGE as error:
         raise TrainerError(
             f"{folder / _TENSORS} is damaged ({reason_of(error)}): remove {folder}, and --resume continues from the "

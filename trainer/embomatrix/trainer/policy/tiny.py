@@ -18,6 +18,7 @@ from embomatrix.trainer.policy.compute_dtype import frozen_weights
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape, PlanCache, PromptCache
 from embomatrix.trainer.policy.grammar import GrammarState, PlanGrammar, PromptNames
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
+from embomatrix.trainer.policy.tensor_file import read_tensors
 from embomatrix.trainer.policy.vocabulary import END, GO, PAD, Vocabulary
 from embomatrix.world.json_text import parse_json
 
@@ -213,7 +214,7 @@ class TinyPolicy:
         policy = cls(
             Vocabulary(words, objects, rooms), shape, seed=0, device=device, compute_dtype=compute_dtype
         )
-        policy.module.load_state_dict(torch.load(folder / _WEIGHTS, map_location=device, weights_only=True))
+        policy.module.load_state_dict(read_tensors(folder / _WEIGHTS, device=device))
         return policy
 
     @staticmethod
