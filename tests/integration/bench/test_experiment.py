@@ -221,9 +221,10 @@ def test_outcome_survives_a_round_trip(tmp_path):
     found = outcome((0.2, None), (0.5, 1.0))
     write_outcome(tmp_path, found)
     assert read_outcome(tmp_path) == found
-    (tmp_path / "outcome.json").write_text('{"schema": 1}')
-    with pytest.raises(TrainerError, match="not the outcome of a finished run"):
-        read_outcome(tmp_path)
+    for damaged in ('{"schema": 1}', "[[]]", "3", "[" * 5_000):
+        (tmp_path / "outcome.json").write_text(damaged)
+        with pytest.raises(TrainerError, match="not the outcome of a finished run"):
+            read_outcome(tmp_path)
 
 
 @pytest.mark.parametrize(

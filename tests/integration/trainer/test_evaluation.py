@@ -156,6 +156,10 @@ def test_report_on_other_tasks_is_rejected_as_a_row(bench, tmp_path):
     assert "me" in text_report(value, [replace(row, label="another")])
     with pytest.raises(TrainerError, match="reports on other tasks"):
         read_row(path, "sha256:0")
+    value["overall"]["success"]["value"] = 10**400
+    path.write_text(json.dumps(value))
+    with pytest.raises(TrainerError, match="is not an evaluation report"):
+        read_row(path, bench.digest)
 
 
 def test_lost_plans_count_in_no_figure(bench):

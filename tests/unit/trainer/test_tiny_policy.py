@@ -1,5 +1,6 @@
 """Word-level policy: shared prompts, vocabulary, saving and loading."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -11,7 +12,10 @@ from tests.fakes.symbolic_household import make_tasks
 from embomatrix.skills.prompt import Codec, plan_in_names, prompt_for
 from embomatrix.skills.syntax import PROFILES
 from embomatrix.trainer.cluster.gateway import parse_policy_text
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import END, UNKNOWN, build_vocabulary
 from embomatrix.world.task import Profile
@@ -153,6 +157,29 @@ def test_saved_policy_can_be_loaded(tmp_path):
     assert TinyPolicy.is_saved_in(tmp_path)
     back = TinyPolicy.load(tmp_path)
     assert draw(back, prompts(back)).texts == draw(made, prompts(made)).texts
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"layers": 10**9},
+        {"width": 2**20},
+        {"inner": 2**30},
+        {"vocabulary": 2**31},
+        {"longest": 2**40},
+        {"heads": 3},
+        {"heads": 0},
+        {"layers": 10**400},
+    ],
+    ids=str,
+)
+def test_description_that_the_weights_contradict_is_refused_at_once(tmp_path, change):
+    policy().save(tmp_path)
+    path = tmp_path / "tiny.json"
+    description = json.loads(path.read_text())
+    path.write_text(json.dumps({**description, "shape": {**description["shape"], **change}}))
+    with pytest.raises(TrainerError, match=r"is damaged .*expected"):
+        saved_policy(tmp_path, TrainSettings())
 
 
 def test_frozen_copy_does_not_change_with_the_policy():

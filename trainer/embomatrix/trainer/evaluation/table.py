@@ -70,7 +70,7 @@ def read_row(path: Path, bench_digest: str) -> ScoreRow:
         raise TrainerError(
             f"the report {path} can't be read ({error.strerror}): expected the report.json of an evaluation"
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise TrainerError(
             f"{path} is not an evaluation report: expected the report.json of an evaluation"
         ) from error

@@ -65,7 +65,7 @@ def read_outcome(folder: Path) -> RunOutcome:
         if value.pop("schema") != SCHEMA:
             raise TrainerError(f"{path} has another version than {SCHEMA}: train again with another --out")
         return TypeAdapter(RunOutcome).validate_python(value)
-    except (OSError, ValueError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise TrainerError(
             f"{path} is not the outcome of a finished run ({reason_of(error)}): finish the run with `embomatrix train --resume`"
         ) from error

@@ -12,7 +12,8 @@ V words.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -36,6 +37,23 @@ class DecoderShape:
     heads: int = 4
     inner: int = 384
     longest: int = 1024
+
+
+def check_weights(shape: DecoderShape, weights: Mapping[str, Tensor]) -> None:
+    """Raise ValueError or KeyError unless the weights have this shape, before a network of it is built."""
+    vocabulary, width = weights["embedding.weight"].shape
+    layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
+    found = replace(
+        shape,
+        vocabulary=vocabulary,
+        layers=layers,
+        width=width,
+        inner=weights["blocks.0.down.weight"].shape[1],
+    )
+    if found != shape or shape.heads < 1 or width % (2 * shape.heads):
+        raise ValueError(
+            f"the weights have the shape {found}: expected {shape}, with heads that divide its width"
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.policy.compute_dtype import frozen_weights
-from embomatrix.trainer.policy.decoder import Decoder, DecoderShape, PlanCache, PromptCache
+from embomatrix.trainer.policy.decoder import Decoder, DecoderShape, PlanCache, PromptCache, check_weights
 from embomatrix.trainer.policy.grammar import GrammarState, PlanGrammar, PromptNames
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
 from embomatrix.trainer.policy.tensor_file import read_tensors
@@ -30,6 +30,8 @@ _MIN_LOGPROB = -80.0
 """Lower log-probabilities do not change an entropy, and their exponentials (denormal floats) take ten times as long."""
 _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
+MAX_CONTEXT: Final = 65_536
+"""Tokens of the longest context of a saved policy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,11 +212,19 @@ class TinyPolicy:
         """Load a policy that ``save`` wrote. Raises OSError, ValueError or RuntimeError if it is damaged."""
         description = parse_json((folder / _DESCRIPTION).read_bytes())
         shape = DecoderShape(**description["shape"])
-        words, objects, rooms = (tuple(description[part]) for part in ("words", "objects", "rooms"))
-        policy = cls(
-            Vocabulary(words, objects, rooms), shape, seed=0, device=device, compute_dtype=compute_dtype
+        words, objects, rooms = (tuple(map(str, description[part])) for part in ("words", "objects", "rooms"))
+        vocabulary, weights = (
+            Vocabulary(words, objects, rooms),
+            read_tensors(folder / _WEIGHTS, device=device),
         )
-        policy.module.load_state_dict(read_tensors(folder / _WEIGHTS, device=device))
+        if len(vocabulary) != shape.vocabulary or not 0 < shape.longest <= MAX_CONTEXT:
+            raise ValueError(
+                f"{_DESCRIPTION} has {len(vocabulary)} words and a context of {shape.longest}: expected {shape.vocabulary} "
+                f"words, and 1 to {MAX_CONTEXT}"
+            )
+        check_weights(shape, weights)
+        policy = cls(vocabulary, shape, seed=0, device=device, compute_dtype=compute_dtype)
+        policy.module.load_state_dict(weights)
         return policy
 
     @staticmethod
