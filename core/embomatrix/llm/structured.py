@@ -9,6 +9,7 @@ from typing import Any, Final, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from embomatrix.llm.values import ChatModel, ChatRequest, Message, Reply, Speaker, UnusableReplyError
+from embomatrix.world.json_text import check_characters
 
 T = TypeVar("T", bound=BaseModel)
 
@@ -67,12 +68,15 @@ def read_json(text: str, shape: type[T]) -> T:
     first_problem = ""
     for value, damaged in _json_values(answer):
         try:
+            check_characters(value)
             return shape.model_validate(value)
         except ValidationError as error:
             # Complete parts of a damaged answer are not the answer.
             first_problem = first_problem or (
                 "its JSON is damaged, or breaks off" if damaged else _problems(error)
             )
+        except ValueError as error:
+            first_problem = first_problem or str(error)
     raise ValueError(first_problem or "it holds no complete JSON value")
 
 

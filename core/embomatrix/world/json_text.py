@@ -18,9 +18,15 @@ def parse_json(text: str | bytes) -> Any:
     try:
         value = json.loads(content)
         if _HALF_PAIR.search(content):
-            json.dumps(value, ensure_ascii=False).encode("utf-8")
+            check_characters(value)
     except RecursionError:
         raise ValueError("it is nested too deep") from None
+    return value
+
+
+def check_characters(value: Any) -> None:
+    """Raise ValueError for half of a surrogate pair in a JSON value."""
+    try:
+        json.dumps(value, ensure_ascii=False).encode("utf-8")
     except UnicodeEncodeError:
         raise ValueError("it contains half of a surrogate pair, which is no character") from None
-    return value

@@ -58,6 +58,7 @@ def test_value_is_found_anywhere_in_the_text(text):
         ),
         ("[1, 2]", "the value: input should be"),
         ("[" * 100_000, "it holds no complete JSON value"),
+        (r'{"name": "Ann \ud83d", "age": 3}', "it contains half of a surrogate pair"),
     ],
 )
 def test_problems_are_reported_by_field(text, sentence):
