@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
+import msgspec
 import psutil
 
 from embomatrix.world.json_text import parse_json
@@ -93,8 +94,8 @@ def running_daemons(state_dir: Path) -> list[WorkerStatus]:
     found = []
     for path in sorted((state_dir.expanduser() / FOLDER).glob("*.json")):
         try:
-            status = WorkerStatus(**parse_json(path.read_bytes()))
-        except (OSError, ValueError, TypeError):
+            status = msgspec.convert(parse_json(path.read_bytes()), WorkerStatus)
+        except (OSError, ValueError):
             continue  # being removed, or of another version
         if _runs(status):
             found.append(status)
@@ -109,6 +110,6 @@ def daemon_pids(state_dir: Path) -> set[int]:
 def _runs(status: WorkerStatus) -> bool:
     try:
         began_s: float = psutil.Process(status.pid).create_time()
-    except psutil.Error:
+    except (psutil.Error, ValueError, OverflowError):
         return False
     return began_s < status.started_s + CLOCK_STEP_S
