@@ -36,8 +36,6 @@ MAX_WALLS: Final = 10_000
 MAX_OBJECTS: Final = 5_000
 MAX_TEXT: Final = 10_000
 """Characters of an instruction or a goal. The longest goal of BEHAVIOR-1K has 1,800."""
-MAX_KEYS_SEARCHED: Final = 1_000
-"""Limit on the search for the key of an invalid value in a mapping."""
 
 _SPACES: Final = r"\x00-\x1f\x7f-\xa0\xad\u1680\u2000-\u200f\u2028-\u202f\u205f-\u206f\u3000"
 _UNPRINTABLE: Final = rf"{_SPACES}\ud800-\uf8ff\ufeff\ufff0-\ufffb"
@@ -268,38 +266,52 @@ def decode(text: bytes, kind: type[T], root: str) -> T:
 def _located(error: msgspec.ValidationError, value: Any, kind: type, root: str) -> SceneInvalidError:
     """Error with the full path.
 
-    msgspec writes ``[...]`` for the key of a mapping; trying the entries one by one finds it.
+    msgspec writes ``[...]`` for the key of a mapping; a search among its entries finds it.
     """
-    message, _, tail = str(error).partition(" - at `$")
+    whole = str(error)
+    # The name of an unknown field may contain the separator, a path never does.
+    message, separator, tail = whole.rpartition(" - at `$")
+    message, tail = (message, tail) if separator else (whole, "")
     path, found = root, value
-    for key, index in re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", tail):
-        if key:
-            path, found = f"{path}.{key}", found[key]
-        elif index != "...":
-            path, found = f"{path}[{index}]", found[int(index)]
-        else:
-            name = _failing_key(found, value, kind, str(error))
-            if name is None:
-                return SceneInvalidError(f"{path}[...]", message)
-            path, found = f"{path}[{name!r}]", found[name]
+    try:
+        for key, index in re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", tail):
+            if key:
+                path, found = f"{path}.{key}", found[key]
+            elif index != "...":
+                path, found = f"{path}[{index}]", found[int(index)]
+            else:
+                name = _failing_key(found, value, kind, whole)
+                if name is None:
+                    return SceneInvalidError(f"{path}[...]", message[:MAX_NAME])
+                path, found = f"{path}[{name[:MAX_NAME]!r}]", found[name]
+    except (LookupError, TypeError, AttributeError):
+        # The name of an unknown field at the root imitates the end of msgspec's message.
+        return SceneInvalidError(root, whole[:MAX_NAME])
     if isinstance(error.__cause__, SceneInvalidError):
         return error.__cause__.below(path)
-    return SceneInvalidError(path, f"found {reprlib.repr(found)}: {message[0].lower()}{message[1:]}")
+    return SceneInvalidError(path, f"found {reprlib.repr(found)}: {message[:1].lower()}{message[1:MAX_NAME]}")
 
 
 def _failing_key(mapping: dict[str, Any], whole: Any, kind: type, message: str) -> str | None:
-    """Key of a mapping inside ``whole`` whose value alone causes the message. The mapping is left unchanged."""
-    entries = dict(mapping)
+    """Key of the first entry of a mapping inside ``whole`` that causes the message. The mapping is left unchanged."""
+    entries = list(mapping.items())
+
+    def fails(some: list[tuple[str, Any]]) -> bool:
+        mapping.clear()
+        mapping.update(some)
+        try:
+            msgspec.convert(whole, kind)
+        except msgspec.ValidationError as error:
+            return str(error) == message
+        return False
+
+    sound, failing = 0, len(entries)  # numbers of first entries
     try:
-        for key in list(entries)[:MAX_KEYS_SEARCHED]:
-            mapping.clear()
-            mapping[key] = entries[key]
-            try:
-                msgspec.convert(whole, kind)
-            except msgspec.ValidationError as error:
-                if str(error) == message:
-                    return key
+        while failing - sound > 1:
+            middle = (sound + failing) // 2
+            sound, failing = (sound, middle) if fails(entries[:middle]) else (middle, failing)
+        # Of two values of one key, the text's first one counts for msgspec, and the mapping holds the last.
+        return entries[sound][0] if fails(entries[sound:failing]) else None
     finally:
         mapping.clear()
         mapping.update(entries)
-    return None

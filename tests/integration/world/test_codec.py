@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -133,6 +134,38 @@ def test_seventeenth_part_of_a_link_is_refused(scene: Scene) -> None:
     parts *= 9
     with pytest.raises(SceneInvalidError, match="length <= 16"):
         scene_from_json(broken)
+
+
+@pytest.mark.parametrize(
+    "name", ["x - at `$.rooms[7]", "x - at `$.rooms.y`", "x` - at `$.assets[...][...]", "`", ""]
+)
+def test_unknown_field_with_a_name_like_the_end_of_a_message_is_refused(scene: Scene, name: str) -> None:
+    for place in ((), ("robot",), ("rooms", 0)):
+        broken = through_text(scene_to_json(scene))
+        part = broken
+        for key in place:
+            part = part[key]
+        part[name] = 1
+        with pytest.raises(SceneInvalidError, match="unknown field"):
+            scene_from_json(broken)
+
+
+def test_field_of_a_megabyte_is_named_by_its_beginning(scene: Scene) -> None:
+    broken = through_text(scene_to_json(scene)) | {"x" * 1_000_000: 1}
+    with pytest.raises(SceneInvalidError) as caught:
+        scene_from_json(broken)
+    assert len(str(caught.value)) < 2_000
+
+
+def test_wrong_value_among_very_many_entries_is_named_at_once(scene: Scene) -> None:
+    broken = through_text(scene_to_json(scene))
+    asset = broken["assets"]["apple-red"]
+    asset["abilities"] = {f"ability {number}": {"a": 1.0} for number in range(60_000)}
+    asset["abilities"]["ability 59998"] = {"a": "hot"}
+    began_s = time.process_time()
+    with pytest.raises(SceneInvalidError, match=r"abilities\['ability 59998'\]\['a'\]: found 'hot'"):
+        scene_from_json(broken)
+    assert time.process_time() - began_s < 5.0
 
 
 def test_every_missing_key_is_named(scene: Scene) -> None:
