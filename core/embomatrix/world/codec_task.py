@@ -44,7 +44,9 @@ def task_of(record: TaskJson, path: str) -> Task:
     except (BddlError, GoalError) as error:
         raise SceneInvalidError(f"{path}.goal", str(error)) from error
     if not scored_atoms(goal, record.types):
-        raise SceneInvalidError(f"{path}.goal", "has no scored atom, so it holds whatever the robot does: expected one")
+        raise SceneInvalidError(
+            f"{path}.goal", "has no scored atom, so it holds whatever the robot does: expected one"
+        )
     if missing:
         raise SceneInvalidError(f"{path}.goal", f"names {min(missing)!r}, which is not in the object table")
     return Task(

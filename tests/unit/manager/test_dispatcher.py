@@ -5,7 +5,7 @@ from tests.fakes.dispatch import Table, crash, leases
 from tests.fakes.worker import completed
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, FinishBatch
-from embomatrix.manager.control.dispatch.state import steps_of
+from embomatrix.manager.control.dispatch.state import LOAD_FAILURES_KEPT, LoadFailures, steps_of
 from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchSubmitted,
@@ -401,3 +401,16 @@ def test_quick_worker_with_many_slots_holds_no_more_leases_than_its_messages_may
     (lease,) = leases(table.submit())
     table.finish(lease)
     assert table.dispatcher.workers["w1"].credits == HELD_LEASES
+
+
+def test_failures_to_load_are_kept_for_a_minute_and_a_limited_number_of_scenes():
+    failures = LoadFailures()
+    for number in range(10 * LOAD_FAILURES_KEPT):
+        failures.record(f"s{number}", "liar", "no mesh", float(number) / 1_000)
+    assert len(failures.scenes()) == LOAD_FAILURES_KEPT
+    failures.record("s1", "liar", "no mesh", 3.0)
+    failures.record("s1", "w1", "no mesh", 30.0)
+    failures.forget_old(80.0)
+    assert failures.scenes() == ("s1",)
+    failures.forget("s1")
+    assert failures.scenes() == ()

@@ -18,7 +18,6 @@ from embomatrix.manager.control.events import (
     WorkerLost,
     WorkerReported,
 )
-from embomatrix.manager.control.schedule.readiness import BELIEVED_MB, SceneCosts
 from embomatrix.manager.observe.run_archive import RunArchive
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
@@ -171,15 +170,6 @@ def test_numbers_of_one_worker_keep_no_scene_from_the_others(cluster, told):
     for at_s in range(3, 120):
         cluster.handle(Tick(), now_s=float(at_s))
     assert cluster.scheduler.desired("w2") == ("kitchen",)
-
-
-def test_memory_of_a_large_scene_counts_when_a_second_worker_measures_it():
-    costs = SceneCosts(guess_mb=64.0)
-    costs.learn("w1", Resident("hall", ResidentState.WARM, 1.0, 5_000.0))
-    assert costs.size_mb("hall") == BELIEVED_MB
-    for worker_id, memory_mb in (("w1", 9_000.0), ("w2", 4_000.0), ("w3", 3_000.0), ("w4", 4_500.0)):
-        costs.learn(worker_id, Resident("hall", ResidentState.WARM, 1.0, memory_mb))
-    assert costs.size_mb("hall") == 4_500.0
 
 
 def _execute_one(cluster):

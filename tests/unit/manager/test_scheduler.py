@@ -21,7 +21,9 @@ from embomatrix.manager.control.events import (
     WorkerLost,
     WorkerReported,
 )
-from embomatrix.manager.control.schedule.placement import Need, Site, needs_of, place
+from embomatrix.manager.control.schedule.placement import MOST_SCENES, Need, Site, needs_of, place
+from embomatrix.manager.control.schedule.readiness import BELIEVED_S, KNOWN_SCENES, SceneCosts
+from embomatrix.manager.control.schedule.residency import KEPT_SCENES
 from embomatrix.manager.control.schedule.scheduler import ScheduleLimits, Scheduler
 from embomatrix.manager.control.workers import WorkerPool
 from embomatrix.rpc.wire.leases import LeaseRef
@@ -249,6 +251,56 @@ def test_scene_larger_than_every_worker_is_unplaceable_with_the_reason(cluster):
     cluster.report(scenes=[])
     assert cluster.scheduler.readiness.warmth("a") is Warmth.UNPLACEABLE
     assert "900 MB" in cluster.scheduler.unplaceable["a"]
+
+
+def test_memory_that_one_worker_claims_keeps_no_other_from_the_scene(cluster):
+    cluster.worker("liar", memory_mb=10**9)
+    cluster.worker("w1", memory_mb=1000)
+    cluster.demand(a=1)
+    cluster.report("liar", scenes=["a"], memory_mb=1e9)
+    cluster.apply(Tick())
+    assert cluster.scheduler.readiness.warmth("a") is Warmth.WARM
+    cluster.pool.leave("liar")
+    cluster.apply(WorkerLost("liar", "revoked"))
+    assert cluster.desired["w1"] == ("a",)
+    assert cluster.scheduler.unplaceable == {}
+
+
+def test_worker_is_filled_by_its_own_measurements(cluster):
+    cluster.worker("liar", memory_mb=1)
+    cluster.worker("w1", memory_mb=1000)
+    cluster.announce(["a", "b", "c"])
+    cluster.report("liar", scenes=["a", "b", "c"], memory_mb=0.1)
+    cluster.report("w1", scenes=["a", "b", "c"], memory_mb=400.0)
+    cluster.apply(Tick())
+    assert len(cluster.desired["w1"]) == 2
+
+
+def test_load_time_that_one_worker_claims_counts_until_another_has_measured_it():
+    costs = SceneCosts(MB)
+    costs.learn("liar", Resident("a", ResidentState.WARM, 86_400.0, 1e9))
+    assert (costs.load_s("a"), costs.size_mb("a")) == (BELIEVED_S, 1e9)
+    costs.learn("w1", Resident("a", ResidentState.WARM, 2.0, 300.0))
+    assert (costs.load_s("a"), costs.size_mb("a")) == (2.0, 300.0)
+    for number in range(20):
+        costs.learn(f"other-{number}", Resident("a", ResidentState.WARM, 3.0, 200.0))
+    assert (costs.load_s("a"), costs.size_mb("a")) == (3.0, 200.0)
+    costs.forget("w1")
+    for number in range(20):
+        costs.forget(f"other-{number}")
+    assert (costs.load_s("a"), costs.size_mb("a")) == (0.0, MB)
+
+
+@pytest.mark.parametrize("state", list(ResidentState))
+def test_worker_that_reports_ever_new_scenes_grows_nothing_without_limit(cluster, state):
+    cluster.worker("liar", memory_mb=10**9)
+    for first in range(0, 20_000, 2_000):
+        cluster.report("liar", state, [f"s{number}" for number in range(first, first + 2_000)], memory_mb=1.0)
+    assert len(cluster.desired.get("liar", ())) <= MOST_SCENES
+    residency = cluster.scheduler._residencies.by_id["liar"]
+    for kept in (residency.failed_s, residency.failure_messages, residency.measured_mb):
+        assert len(kept) <= KEPT_SCENES
+    assert len(cluster.scheduler._costs._scenes) <= KNOWN_SCENES
 
 
 def test_failed_load_moves_to_another_worker_and_is_retried_later(cluster):

@@ -88,7 +88,7 @@ def test_bundle_of_the_first_format_names_the_remedy() -> None:
 def test_goal_without_an_atom_is_refused(bundle: Bundle, task: Task, goal: str) -> None:
     """It holds whatever the robot does, and no result of it agrees with its atoms."""
     vacuous = dataclasses.replace(task, goal_bddl=goal)
-    with pytest.raises(BundleError, match="goal: has no scored atom, .* expected one"):
+    with pytest.raises(BundleError, match="goal: has no scored atom"):
         decode_bundle(encode_bundle(dataclasses.replace(bundle, tasks={task.task_id: vacuous})))
 
 

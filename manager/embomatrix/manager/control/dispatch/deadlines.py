@@ -42,6 +42,7 @@ def tick(state: DispatchState) -> None:
     for record, had_s in state.batches.overdue(state.now_s):
         failure = InfraFailure(InfraCode.DEADLINE, f"no outcome within {had_s:g} s of its submission")
         finish(state, record, failure)
+    state.load_failures.forget_old(state.now_s)
     for scene in state.load_failures.scenes():
         judge_scene(state, scene)
     _fail_unplaceable(state)

@@ -1,6 +1,6 @@
 """State of the dispatcher: its one owner, with its invariants and the recent history of every rollout."""
 
-from collections import Counter, OrderedDict, deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Final
@@ -21,10 +21,10 @@ HISTORY_KEPT: Final = 32_768
 """Steps of all rollouts that ``explain`` can look back on, at about 150 bytes each."""
 REASON_CHARS: Final = 200
 """Characters of a reason in the history. A worker's own words may have thousands."""
-SCENES_KEPT: Final = 1_024
-"""Scenes whose failures to load are remembered. Workers name them, and each is examined at every tick."""
 WITNESSES: Final = 2
 """Workers that must fail to load a scene before the scene itself is to blame."""
+LOAD_FAILURES_KEPT: Final = 256
+"""Failures to load of one worker that are kept."""
 LOAD_FAILURE_MEMORY_S: Final = 60.0
 """A load failure that is not repeated for this long is forgotten, so that a repaired scene gets another try."""
 
@@ -91,21 +91,42 @@ class _LoadFailure:
 
 
 class LoadFailures:
-    """Failures to load, by scene and worker: of the ``SCENES_KEPT`` scenes that failed last."""
+    """Failures to load of the last minute, by scene and worker."""
 
     def __init__(self) -> None:
-        self._by_scene: OrderedDict[str, dict[str, _LoadFailure]] = OrderedDict()
+        self._by_scene: dict[str, dict[str, _LoadFailure]] = {}
+        self._by_worker: dict[str, dict[str, None]] = {}
+        """Scenes that each worker failed to load, the latest failure last."""
 
     def record(self, scene: str, worker_id: str, error: str, now_s: float) -> None:
         failures = self._by_scene.setdefault(scene, {})
         known = failures.get(worker_id)
         failures[worker_id] = _LoadFailure(known.first_s if known else now_s, now_s, error)
-        self._by_scene.move_to_end(scene)
-        if len(self._by_scene) > SCENES_KEPT:
-            self._by_scene.popitem(last=False)
+        scenes = self._by_worker.setdefault(worker_id, {})
+        scenes.pop(scene, None)
+        scenes[scene] = None
+        if len(scenes) > LOAD_FAILURES_KEPT:
+            self._remove(next(iter(scenes)), worker_id)
 
     def forget(self, scene: str) -> None:
-        self._by_scene.pop(scene, None)
+        for worker_id in tuple(self._by_scene.get(scene, ())):
+            self._remove(scene, worker_id)
+
+    def forget_old(self, now_s: float) -> None:
+        """Forget the failures that are older than a minute."""
+        for scene, failures in tuple(self._by_scene.items()):
+            for worker_id, failure in tuple(failures.items()):
+                if now_s - failure.last_s > LOAD_FAILURE_MEMORY_S:
+                    self._remove(scene, worker_id)
+
+    def _remove(self, scene: str, worker_id: str) -> None:
+        for index, key, inner in (
+            (self._by_scene, scene, worker_id),
+            (self._by_worker, worker_id, scene),
+        ):
+            del index[key][inner]
+            if not index[key]:
+                del index[key]
 
     def scenes(self) -> tuple[str, ...]:
         return tuple(self._by_scene)
@@ -115,13 +136,12 @@ class LoadFailures:
 
         ``live`` workers can try. A scene that all of them failed to load gets ``timeout_s`` from the first failure.
         """
-        failures = self._by_scene.get(scene, {})
-        for worker_id in [
-            name for name, failure in failures.items() if now_s - failure.last_s > LOAD_FAILURE_MEMORY_S
-        ]:
-            del failures[worker_id]
+        failures = {
+            name: failure
+            for name, failure in self._by_scene.get(scene, {}).items()
+            if now_s - failure.last_s <= LOAD_FAILURE_MEMORY_S
+        }
         if not failures:
-            self._by_scene.pop(scene, None)
             return None
         alone = live <= len(failures) and now_s - min(f.first_s for f in failures.values()) >= timeout_s
         if len(failures) < WITNESSES and not alone:

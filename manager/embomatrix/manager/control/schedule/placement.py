@@ -15,7 +15,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from embomatrix.rpc.wire.values import LookaheadEntry
@@ -61,6 +61,8 @@ def quotas(wanted: Mapping[RunShare, int], slots: int) -> dict[RunShare, float]:
 
 
 EVERYONE: Final = RunShare()
+MOST_SCENES: Final = 1_024
+"""Most scenes that a worker is ordered to hold. Those with live leases stay beyond it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +100,8 @@ class Site:
     """Scenes with live leases, which stay."""
     refused: frozenset[str] = frozenset()
     """Scenes that the worker cannot hold."""
+    measured_mb: Mapping[str, float] = field(default_factory=dict)
+    """Memory of scenes as the worker itself measured it."""
 
     @property
     def capacity(self) -> float:
@@ -173,14 +177,17 @@ class _Shelf:
 
     def has_room_for(self, scene: str) -> bool:
         """True if the scene fits. The first always fits, so that an estimate keeps no small worker from trying."""
-        return not self.chosen or self._size_mb(scene) <= self.free_mb
+        return not self.chosen or (len(self.chosen) < MOST_SCENES and self._size(scene) <= self.free_mb)
 
     def accepts(self, scene: str) -> bool:
         return scene not in self.site.refused and self.has_room_for(scene)
 
     def take(self, scene: str) -> None:
         self.chosen[scene] = None
-        self.free_mb -= self._size_mb(scene)
+        self.free_mb -= self._size(scene)
+
+    def _size(self, scene: str) -> float:
+        return self.site.measured_mb.get(scene) or self._size_mb(scene)
 
     def keep_the_rest(self) -> None:
         """Keep unneeded residents while there is room, the last used first."""

@@ -1,72 +1,97 @@
 """Readiness forecast for trainers and operators: when each scene will be warm, or why it will not."""
 
-from collections import OrderedDict
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from statistics import median_low
 from typing import Final
 
 from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
-from embomatrix.manager.control.schedule.residency import Residencies, WorkerResidency
+from embomatrix.manager.control.schedule.residency import Residencies, WorkerResidency, keep_newest
 from embomatrix.rpc.wire.values import LookaheadAnswer, PlanCell, Resident, ResidentState, Warmth
 
-SCENES_KEPT: Final = 16_384
-"""Scenes whose costs are remembered: those that workers reported last."""
-BELIEVED_MB: Final = 1_024.0
-"""Most memory of a scene that one worker's report proves. More counts as far as a second worker reports it."""
 BELIEVED_S: Final = 60.0
 """Longest load time that is learnt, so that one false report does not keep scenes from other workers."""
 LEARNING: Final = 0.05
 """Weight of the latest measurement in moving averages."""
+KNOWN_SCENES: Final = 8_192
+"""Scenes whose measurements are kept. Those that were first measured earliest are forgotten."""
+WITNESSES: Final = 9
+"""Workers whose measurements of a scene are kept."""
+
+
+@dataclass(slots=True)
+class _Measured:
+    """Measurements of one scene by worker, and what counts."""
+
+    memory_mb: dict[str, float] = field(default_factory=dict)
+    load_s: dict[str, float] = field(default_factory=dict)
+    usual_mb: float = 0.0
+    usual_load_s: float = 0.0
+
+    def update(self) -> None:
+        self.usual_mb = median_low(self.memory_mb.values()) if self.memory_mb else 0.0
+        self.usual_load_s = median_low(self.load_s.values()) if self.load_s else 0.0
 
 
 class SceneCosts:
-    """Measured memory, load time and execution time of scenes. Times are 0 before the first measurement."""
+    """Measured memory, load time and execution time of scenes. Times are 0 before the first measurement.
+
+    The lower median of the present workers counts: a lie counts only while no other worker has measured the scene.
+    """
 
     def __init__(self, guess_mb: float) -> None:
         self._guess_mb = guess_mb
-        self.measured_mb: OrderedDict[str, float] = OrderedDict()
-        self._large: dict[str, list[tuple[float, str]]] = {}
-        #: Scenes reported beyond ``BELIEVED_MB``: the two largest reports of different workers.
-        self.load_s: OrderedDict[str, float] = OrderedDict()
+        self._scenes: dict[str, _Measured] = {}
         self.typical_load_s = 0.0
         self.execute_s = 0.0
         """Execution time on a slot of speed 1."""
 
     def size_mb(self, scene: str) -> float:
-        return self.measured_mb.get(scene, self._guess_mb)
+        known = self._scenes.get(scene)
+        return known.usual_mb or self._guess_mb if known is not None else self._guess_mb
+
+    def load_s(self, scene: str) -> float:
+        """Return the load time of the scene; 0 while it is unknown."""
+        known = self._scenes.get(scene)
+        return known.usual_load_s if known is not None else 0.0
 
     def usual_load_s(self, scene: str) -> float:
         """Return the load time of the scene, or of a typical one."""
-        return self.load_s.get(scene, self.typical_load_s)
+        return self.load_s(scene) or self.typical_load_s
 
     def learn(self, worker_id: str, resident: Resident) -> None:
-        scene, load_s = resident.bundle_digest, min(resident.load_s, BELIEVED_S)
-        if resident.memory_mb > 0:
-            proven_mb = self._proven_mb(worker_id, scene, resident.memory_mb)
-            self.measured_mb[scene] = max(self.measured_mb.get(scene, 0.0), proven_mb)
-        if resident.state is ResidentState.WARM and load_s > 0:
-            self.load_s[scene] = 0.5 * (self.load_s.get(scene, load_s) + load_s)
-            self.typical_load_s = _averaged(self.typical_load_s, load_s)
-        for costs in (self.measured_mb, self.load_s):
-            if scene in costs:
-                costs.move_to_end(scene)
-            if len(costs) > SCENES_KEPT:
-                forgotten, _ = costs.popitem(last=False)
-                if costs is self.measured_mb:
-                    self._large.pop(forgotten, None)
+        """Add the measurements of a worker."""
+        known = self._scenes.get(resident.bundle_digest)
+        if known is None:
+            known = self._scenes[resident.bundle_digest] = _Measured()
+            keep_newest(self._scenes, KNOWN_SCENES)
+        changed = False
+        if resident.memory_mb > known.memory_mb.get(worker_id, 0.0):
+            known.memory_mb[worker_id] = resident.memory_mb
+            keep_newest(known.memory_mb, WITNESSES)
+            changed = True
+        if resident.state is ResidentState.WARM and resident.load_s > 0:
+            load_s = min(resident.load_s, BELIEVED_S)
+            if load_s != known.load_s.get(worker_id):
+                known.load_s[worker_id] = load_s
+                keep_newest(known.load_s, WITNESSES)
+                changed = True
+            if changed:
+                known.update()
+            self.typical_load_s = _averaged(self.typical_load_s, known.usual_load_s)
+        elif changed:
+            known.update()
+
+    def forget(self, worker_id: str) -> None:
+        """Drop the measurements of a worker that left."""
+        for known in self._scenes.values():
+            measured = known.memory_mb.pop(worker_id, None), known.load_s.pop(worker_id, None)
+            if measured != (None, None):
+                known.update()
 
     def executed(self, seconds: float) -> None:
         """Add an execution time, in seconds on a slot of speed 1."""
         self.execute_s = _averaged(self.execute_s, seconds)
-
-    def _proven_mb(self, worker_id: str, scene: str, memory_mb: float) -> float:
-        """Return the part of the reported memory that one worker may prove, or that two agree on."""
-        if memory_mb <= BELIEVED_MB:
-            return memory_mb
-        reports = {name: size for size, name in self._large.get(scene, ())}
-        reports[worker_id] = max(reports.get(worker_id, 0.0), memory_mb)
-        largest = sorted(((size, name) for name, size in reports.items()), reverse=True)[:2]
-        self._large[scene] = largest
-        return largest[1][0] if len(largest) > 1 else BELIEVED_MB
 
 
 class ReadinessForecast:

@@ -3,17 +3,24 @@
 import bisect
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, MutableMapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeVar
 
 from embomatrix.manager.control.schedule.placement import Need, Site
 from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.values import Resident, ResidentState
 
-FAILURES_KEPT: Final = 256
-"""Failed scenes of one worker that are remembered after it stops reporting them."""
+T = TypeVar("T")
+KEPT_SCENES: Final = 1_024
+"""Scenes of a worker whose measurements and failures are kept after it stops reporting them."""
+
+
+def keep_newest(entries: MutableMapping[str, T], most: int) -> None:
+    """Drop the entries that were added first, until so many are left."""
+    while len(entries) > most:
+        del entries[next(iter(entries))]
 
 
 @dataclass(slots=True, eq=False)
@@ -28,6 +35,10 @@ class WorkerResidency:
     failed_s: dict[str, float] = field(default_factory=dict)
     failure_messages: dict[str, str] = field(default_factory=dict)
     """Message of each scene that failed to load, kept after the worker stops reporting the scene."""
+    measured_mb: dict[str, float] = field(default_factory=dict)
+    """Largest memory of each scene that the worker reported."""
+    too_large: set[str] = field(default_factory=set)
+    """Scenes of ``measured_mb`` beyond its memory. A size that others report keeps no worker from trying."""
     desired: tuple[str, ...] | None = None
     """The last desired set; None if the worker may not have received it."""
     score_limit: float = math.inf
@@ -61,6 +72,7 @@ class WorkerResidency:
     def note(self, resident: Resident, now_s: float) -> None:
         """Record the reported state of a scene."""
         scene = resident.bundle_digest
+        self._measure(scene, resident.memory_mb)
         if resident.state is not ResidentState.WARM:
             self.warm_since_s.pop(scene, None)
         if resident.state is not ResidentState.LOADING:
@@ -68,8 +80,8 @@ class WorkerResidency:
         if resident.state is ResidentState.FAILED:
             self.failed_s.setdefault(scene, now_s)
             self.failure_messages[scene] = resident.error
-            if len(self.failed_s) > FAILURES_KEPT:
-                self._forget_failure(next(iter(self.failed_s)))
+            keep_newest(self.failed_s, KEPT_SCENES)
+            keep_newest(self.failure_messages, KEPT_SCENES)
             return
         since_s = self.warm_since_s if resident.state is ResidentState.WARM else self.loading_since_s
         since_s.setdefault(scene, now_s)
@@ -78,6 +90,15 @@ class WorkerResidency:
     def _forget_failure(self, scene: str) -> None:
         self.failed_s.pop(scene, None)
         self.failure_messages.pop(scene, None)
+
+    def _measure(self, scene: str, memory_mb: float) -> None:
+        if memory_mb <= self.measured_mb.get(scene, 0.0):
+            return
+        self.measured_mb[scene] = memory_mb
+        keep_newest(self.measured_mb, KEPT_SCENES)
+        if memory_mb > self.worker.resources.memory_mb:
+            self.too_large.add(scene)
+        self.too_large &= self.measured_mb.keys()
 
     def loads_in_time(self, scene: str, now_s: float, overdue_s: float) -> bool:
         """True if the worker is loading the scene, is not slow, and the load is not overdue."""
@@ -191,10 +212,6 @@ class Residencies:
         return [residency for residency in residencies if residency.worker.usable]
 
     @property
-    def least_memory_mb(self) -> int:
-        return min(self._memory_mb, default=0)
-
-    @property
     def most_memory_mb(self) -> int:
         return max(self._memory_mb, default=0)
 
@@ -234,16 +251,12 @@ class ResidencySites:
         retry_s: float,
         *,
         needs: Sequence[Need],
-        measured_mb: Mapping[str, float],
     ) -> None:
         self._residencies = residencies
         self._now_s = now_s
         self._in_use = in_use
         self._retry_s = retry_s
         self._rendering = frozenset(need.bundle_digest for need in needs if need.render)
-        sizes = ((need.bundle_digest, measured_mb.get(need.bundle_digest, 0.0)) for need in needs)
-        self._large = [(scene, size) for scene, size in sizes if size > residencies.least_memory_mb]
-        """Scenes with a measured size beyond the memory of some worker."""
         self._refused: dict[str, frozenset[str]] = {}
 
     @property
@@ -265,10 +278,11 @@ class ResidencySites:
             residents=assigned,
             pinned=frozenset(scene for scene in assigned if (worker_id, scene) in self._in_use),
             refused=self.refused(residency),
+            measured_mb=residency.measured_mb,
         )
 
     def refused(self, residency: WorkerResidency) -> frozenset[str]:
-        """Return the scenes that recently failed there, that do not fit, or that need a GPU."""
+        """Return the scenes that recently failed there, that it measured as too large, or that need a GPU."""
         known = self._refused.get(residency.worker_id)
         if known is None:
             known = self._refused[residency.worker_id] = frozenset(self._refusals(residency))
@@ -276,8 +290,7 @@ class ResidencySites:
 
     def _refusals(self, residency: WorkerResidency) -> set[str]:
         refused = {scene for scene, at_s in residency.failed_s.items() if self._now_s - at_s < self._retry_s}
-        memory_mb = residency.worker.resources.memory_mb
-        refused.update(scene for scene, size in self._large if size > memory_mb)
+        refused.update(residency.too_large)
         if self._rendering and not residency.renders:
             refused.update(self._rendering)
         return refused

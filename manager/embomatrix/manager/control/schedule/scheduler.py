@@ -142,7 +142,6 @@ class Scheduler:
             self._demand.in_use,
             self._limits.retry_load_s,
             needs=needs,
-            measured_mb=self._costs.measured_mb,
         )
         placement = place(sites, needs, self._costs.size_mb)
         self._residencies.fresh.clear()
@@ -222,6 +221,7 @@ class Scheduler:
                     self._residencies.join(self._workers[worker_id])
                 return Urgency.NONE
             case WorkerLost(worker_id):
+                self._costs.forget(worker_id)
                 self._residencies.leave(worker_id)
                 return Urgency.NOW
 
@@ -256,11 +256,7 @@ class Scheduler:
         waited_s = self._demand.waited_s.get(scene, 0.0)
         ordered = [r for r in self._residencies.having(scene) if scene in (r.desired or ())]
         # The load time on slow workers says nothing about the others.
-        load_s = (
-            self._costs.typical_load_s
-            if all(r.is_slow for r in ordered)
-            else self._costs.load_s.get(scene, 0.0)
-        )
+        load_s = self._costs.typical_load_s if all(r.is_slow for r in ordered) else self._costs.load_s(scene)
         if waited_s >= (load_s or self._limits.affinity_wait_s):
             overdue_s = max(OVERDUE * self._costs.usual_load_s(scene), self._limits.affinity_wait_s)
             loading = any(r.loads_in_time(scene, self._now_s, overdue_s) for r in ordered)
@@ -290,15 +286,15 @@ class Scheduler:
     def _order(self, name: str, scenes: tuple[str, ...]) -> SetDesired | None:
         """Return the order for a worker; None if neither the set nor the order of its loads changes."""
         residency = self._residencies.by_id[name]
-        before = residency.desired
+        before, ordered = residency.desired, set(scenes)
         if (
             before is not None
-            and set(before) == set(scenes)
+            and set(before) == ordered
             and residency.to_load(before) == residency.to_load(scenes)
         ):
             return None
         for scene in residency.to_load(before or ()):
-            if scene not in scenes and scene not in residency.residents:
+            if scene not in ordered and scene not in residency.residents:
                 self.prewarm.withdrawn(name, scene)
         for scene in residency.to_load(scenes):
             run_id = next((run for run, window in self.windows.items() if window.announces(scene)), None)
