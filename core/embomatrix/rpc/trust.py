@@ -37,8 +37,12 @@ def read_token(text: str) -> str:
         return text
     try:
         return Path(text[1:]).expanduser().read_text(encoding="ascii").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        problem = error.strerror if isinstance(error, OSError) else "it contains no token"
+    except (OSError, ValueError, RuntimeError) as error:
+        if isinstance(error, OSError):
+            problem = error.strerror
+        else:
+            # Paths with a null character, and with the home of an unknown user, raise the others.
+            problem = "it contains no token" if isinstance(error, UnicodeDecodeError) else str(error)
         raise InvalidRequestError(
             f"--token {text}: the file can't be read ({problem}): name the file that contains the token"
         ) from error

@@ -20,6 +20,7 @@ from embomatrix.factory.commands.assets import app
 from embomatrix.factory.commands.scenes import app as scene_app
 from embomatrix.factory.importers.assemble import ImportedAsset, convex_part, import_model, read_model
 from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, Coacd, by_components
+from embomatrix.factory.importers.convex import _kept as kept_pieces
 from embomatrix.factory.importers.model import Mesh, ModelFileError
 from embomatrix.factory.importers.shelf import read_assets, save_asset
 from embomatrix.factory.scenes.build import build_base_scene
@@ -222,6 +223,9 @@ def test_decomposition_is_cached_by_content_and_damaged_files_are_ignored(tmp_pa
     kept = [mesh.vertices[:4].tolist()]
     (tmp_path / f"{cutter.key(mesh, 16)}.json").write_text(json.dumps(kept))
     assert np.asarray(cutter(mesh, 16)).tolist() == kept
+    for damaged in ("{", "[]", "[[[0, 0]]]", "[[[1e999, 0, 0]]]", "[" + "9" * 400 + "]"):
+        (tmp_path / "damaged.json").write_text(damaged)
+        assert kept_pieces(tmp_path / "damaged.json") is None
 
 
 def test_folder_of_assets_is_read_back_equal_and_damaged_files_are_named(tmp_path: Path) -> None:

@@ -152,6 +152,10 @@ def test_files_that_hold_no_token_or_certificate_are_named(tmp_path):
     assert read_ca(None) == b""
     with pytest.raises(InvalidRequestError, match="can't be read"):
         read_token(f"@{tmp_path / 'nothing'}")
+    with pytest.raises(InvalidRequestError, match="null byte"):
+        read_token("@\0")
+    with pytest.raises(InvalidRequestError, match="home directory"):
+        read_token("@~unknown_user/token")
     with pytest.raises(InvalidRequestError, match=r"contains no (PEM )?certificate"):
         read_ca(tmp_path / "token")
     with pytest.raises(InvalidRequestError, match="can't be read"):

@@ -113,7 +113,7 @@ def _kept(path: Path) -> list[FloatArray] | None:
     """Return the pieces of a cache file; None if it is missing or damaged."""
     try:
         pieces = [np.asarray(piece, dtype=np.float64) for piece in parse_json(path.read_bytes())]
-    except (OSError, ValueError, TypeError):
+    except (OSError, ValueError, TypeError, OverflowError):
         return None
     sound = all(piece.ndim == 2 and piece.shape[1] == 3 and np.isfinite(piece).all() for piece in pieces)
     return pieces if pieces and sound else None
