@@ -34,6 +34,8 @@ HTTP_S: Final = 0.5
 CALLS_AT_ONCE: Final = 8
 STRIKES_PER_SESSION: Final = 40
 """Messages in one session, unless the manager ends it earlier. A new stream begins with a full state and its claims."""
+SOUND_START: Final = 0.7
+"""Share of streams that begin with a sound state. The others begin with any message."""
 UNREACHABLE_S: Final = 0.05
 REST_S: Final = 0.001
 """Pause after a message in a session, so that its answer can be read."""
@@ -234,7 +236,8 @@ async def _fight_in_session(
     kind = KINDS["any Session"]
     listening = asyncio.create_task(_collect_leases(stream, known, maker))
     try:
-        await stream.write(first_state(known).SerializeToString())
+        if rng.random() < SOUND_START:
+            await stream.write(first_state(known).SerializeToString())
         for _ in range(STRIKES_PER_SESSION):
             if fight.over or listening.done():
                 return

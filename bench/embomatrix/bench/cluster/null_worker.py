@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable
 from typing import Final
 
 from embomatrix.proto.v1 import worker_service_pb2 as pb
@@ -46,11 +46,21 @@ async def register_null_worker(address: str, name: str, slots: int) -> Registrat
 
 
 class NullWorker:
-    """One session of a null worker. Unless it ``answers``, it keeps its leases and stays present."""
+    """One session of a null worker. Unless it ``answers``, it keeps its leases and stays present.
 
-    def __init__(self, registration: Registration, *, answers: bool = False) -> None:
+    ``on_leases`` receives the time of each message with leases that follows results, and the seconds since those.
+    """
+
+    def __init__(
+        self,
+        registration: Registration,
+        *,
+        answers: bool = False,
+        on_leases: Callable[[float, float], None] = lambda at_s, waited_s: None,
+    ) -> None:
         self._registration = registration
         self._answers = answers
+        self._on_leases = on_leases
         self._prepared: dict[Plan, Completed] = {}
         self._outgoing: asyncio.Queue[pb.SessionRequest] = asyncio.Queue()
         self._held: dict[LeaseRef, Rollout] = {}
@@ -74,7 +84,7 @@ class NullWorker:
             if response.leases:
                 now_s = time.monotonic()
                 if self._sent_s is not None:
-                    sys.stdout.write(f"{now_s} {now_s - self._sent_s}\n")
+                    self._on_leases(now_s, now_s - self._sent_s)
                     self._sent_s = None
                 self._held |= {
                     lease_ref_from_proto(lease.ref): unread_rollout(lease.rollout)
@@ -142,7 +152,11 @@ async def main(address: str, slots: str) -> None:
     registration = await register_null_worker(address, "null", int(slots))
     async with open_channel(address) as channel:
         stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
-        await NullWorker(registration, answers=True).run(stub, ())
+        await NullWorker(registration, answers=True, on_leases=_print).run(stub, ())
+
+
+def _print(at_s: float, waited_s: float) -> None:
+    sys.stdout.write(f"{at_s} {waited_s}\n")
 
 
 if __name__ == "__main__":
