@@ -10,7 +10,7 @@ ARGS ?=
 
 DEFAULT_TESTS := not slow and not docker and not hf and not eai and not peers
 
-.PHONY: run test test-unit test-slow test-random test-random-hour house lint types contracts proto proto-check check site diagrams compose-check pictures clean
+.PHONY: run test test-unit test-slow test-random test-random-hour fuzz house lint types contracts proto proto-check check site diagrams compose-check pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
@@ -38,6 +38,11 @@ test-random-hour: $(VENV)/.dev
 	  HYPOTHESIS_PROFILE=random nice -n 19 $(BIN)/python -m pytest tests/unit tests/integration -n 1 -p no:cacheprovider -q \
 	    -m "hypothesis and not docker and not slow" $(ARGS) || exit 1; \
 	done
+
+# Inputs that break a decoder, searched for `SECONDS_LEFT` seconds and kept in build/fuzz. The search is guided by coverage after
+# `pip install -e .[fuzz]`. `ARGS='plan "scene file"'` narrows it.
+fuzz: $(VENV)/.dev
+	nice -n 10 $(BIN)/python -m tests.fuzz.search --seconds $(SECONDS_LEFT) $(ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
