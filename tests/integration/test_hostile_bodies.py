@@ -11,13 +11,16 @@ from embomatrix.manager.web.parsing import AnswerParser
 from embomatrix.rpc.status import InvalidRequestError, UnavailableError
 
 
-def request_of(*chunks, address="10.0.0.1", ends=True):
-    """Return a request whose body comes in these chunks, and never ends unless it ``ends``."""
+def request_of(*chunks, address="10.0.0.1", ends=True, leaves=False):
+    """Return a request whose body comes in these chunks, and never ends unless it ``ends`` or its sender ``leaves``."""
     waiting = list(chunks)
 
     async def receive():
+        if leaves and not waiting:
+            return {"type": "http.disconnect"}
         if waiting:
-            return {"type": "http.request", "body": waiting.pop(0), "more_body": bool(waiting) or not ends}
+            body = waiting.pop(0)
+            return {"type": "http.request", "body": body, "more_body": bool(waiting) or leaves or not ends}
         return await asyncio.Event().wait()
 
     return Request({"type": "http", "method": "POST", "headers": [], "client": (address, 1)}, receive)
@@ -32,6 +35,12 @@ async def status_of(budget, request):
 async def test_body_that_never_ends_is_given_up_and_its_bytes_are_free_again():
     budget = BodyBudget(body_s=0.05, all_bytes=100)
     assert await status_of(budget, request_of(b"x" * 90, ends=False)) == 408
+    assert await budget.receive(request_of(b"x" * 90)) == b"x" * 90
+
+
+async def test_body_whose_sender_leaves_is_no_error_of_the_manager_and_its_bytes_are_free_again():
+    budget = BodyBudget(all_bytes=100)
+    assert await status_of(budget, request_of(b"x" * 90, leaves=True)) == 400
     assert await budget.receive(request_of(b"x" * 90)) == b"x" * 90
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from typing import Final
 
 from fastapi import HTTPException, Request
+from starlette.requests import ClientDisconnect
 
 LARGEST_BYTES: Final = 16 * 1024 * 1024
 """Bytes of one body."""
@@ -26,7 +27,8 @@ class BodyBudget:
         self._held: Counter[str] = Counter()
 
     async def receive(self, request: Request) -> bytes:
-        """Return the body. Raise HTTP 413, 429 or 503 beyond a budget, and 408 for a body that does not end in time.
+        """Return the body. Raise HTTP 413, 429 or 503 beyond a budget, 408 for a body that does not end in time, and 400
+        for one whose sender left.
 
         The caller releases the bytes of a returned body.
         """
@@ -46,6 +48,8 @@ class BodyBudget:
             if isinstance(error, TimeoutError):
                 text = f"the body did not end within {self._body_s:g} s: send it without pauses"
                 raise HTTPException(408, text) from None
+            if isinstance(error, ClientDisconnect):
+                raise HTTPException(400, "the sender left before the end of the body") from None
             raise
         return bytes(body)
 
