@@ -57,7 +57,7 @@ OWN: Final[Mapping[str, str]] = {
     "bench.adversary.sequences:_Stage._register": BENCH,
     "bench.adversary.sequences:_honest_run": BENCH,
     "bench.adversary.sequences:_honest_worker": BENCH,
-    "bench.adversary.siege:_read_state": BENCH,
+    "bench.adversary.siege:read_state": BENCH,
     "bench.experiments.benchmarks:bench_table": BENCH,
     "bench.experiments.cli:_conduct": BENCH,
     "bench.experiments.design:_is_toml": BENCH,

@@ -217,6 +217,7 @@ async def hostile_worker(
                     known.leases.clear()
                     await _fight_in_session(channel, known, arsenal, rng, fight)
                     answer = await _register(channel, known.token, sound_registration(known))
+        await asyncio.sleep(UNREACHABLE_S)
 
 
 async def _register(

@@ -1,11 +1,12 @@
 """Honest null worker that joins with a token and registers again after its session ends, as a daemon does.
 
-``python -m embomatrix.bench.adversary.honest ADDRESS NAME TOKEN_FILE SLOTS`` runs one until killed. It waits
-for the file.
+``python -m embomatrix.bench.adversary.honest ADDRESSES NAME TOKEN_FILE SLOTS`` runs one until killed. It waits
+for the file, and tries the managers in turn.
 """
 
 import asyncio
 import contextlib
+import itertools
 import sys
 import time
 from dataclasses import replace
@@ -31,11 +32,12 @@ def _token_in(file: Path) -> str:
     return file.read_text(encoding="ascii")
 
 
-async def main(address: str, name: str, token: str, slots: str) -> None:
+async def main(addresses: str, name: str, token: str, slots: str) -> None:
     """Serve as one worker until killed."""
-    member = Membership(address, name, token, joining=True)
+    member = Membership("", name, token, joining=True)
     resources = Resources(int(slots), int(slots), MEMORY_MB)
-    while True:
+    for address in itertools.cycle(addresses.split(",")):
+        member = replace(member, manager=address)
         with contextlib.suppress(ClusterError, ExceptionGroup):
             registration = await register(member, boot_id=name, resources=resources)
             if registration.credential:
@@ -48,5 +50,5 @@ async def main(address: str, name: str, token: str, slots: str) -> None:
 
 
 if __name__ == "__main__":
-    address, name, token_file, slots = sys.argv[1:]
-    asyncio.run(main(address, name, _token_in(Path(token_file)), slots))
+    managers, name, token_file, slots = sys.argv[1:]
+    asyncio.run(main(managers, name, _token_in(Path(token_file)), slots))

@@ -122,19 +122,35 @@ async def battlefield(
     folder: Path, workload: Workload, *options: str, honest: int = 2
 ) -> AsyncIterator[Field]:
     """Start a manager with tokens and honest workers. Raise BenchError if they don't serve in time."""
-    secret = folder / "admin.token"
-    secret.write_text(ADMIN, encoding="ascii")
     with contextlib.ExitStack() as processes:
         store = (f"--state=sqlite:{folder / 'state.sqlite'}", f"--data-dir={folder / 'manager'}")
-        manager = processes.enter_context(running_manager(folder, f"--token=@{secret}", *store, *options))
+        manager = processes.enter_context(running_manager(folder, admin_token(folder), *store, *options))
         served = await asyncio.to_thread(manager.wait_for, SERVES, time.monotonic() + START_S)
+        page = served[2].removeprefix("http://").rstrip("/")
+        async with occupied(folder, manager, served[1], (served[1], page), workload, honest) as place:
+            yield place
+
+
+def admin_token(folder: Path) -> str:
+    """Return the option of a manager whose operator has the secret ``ADMIN``."""
+    secret = folder / "admin.token"
+    secret.write_text(ADMIN, encoding="ascii")
+    return f"--token=@{secret}"
+
+
+@contextlib.asynccontextmanager
+async def occupied(
+    folder: Path, manager: Process, addresses: str, target: tuple[str, str], workload: Workload, honest: int
+) -> AsyncIterator[Field]:
+    """Start honest workers that know the ``addresses``, and upload the scenes. ``target`` is attacked, gRPC and HTTP."""
+    with contextlib.ExitStack() as processes:
         tokens = {f"honest-{number}": folder / f"{number}.token" for number in range(1, honest + 1)}
         for name, file in tokens.items():
             # They start before this process opens a channel: a fork beside gRPC's threads may hang.
             processes.enter_context(
-                running_process(folder, name, HONEST, served[1], name, str(file), str(SLOTS))
+                running_process(folder, name, HONEST, addresses, name, str(file), str(SLOTS))
             )
-        async with ClusterClient(served[1], ADMIN) as client:
+        async with ClusterClient(addresses, ADMIN) as client:
 
             async def join() -> str:
                 return (await client.issue_token(AccessRole.JOIN))[0]
@@ -143,16 +159,10 @@ async def battlefield(
                 write_whole(file, (await join()).encode("ascii"))
             await _ready(client, tuple(tokens))
             await client.put_bundles(workload.bundles)
-            target = Target(
-                served[1],
-                served[2].removeprefix("http://").rstrip("/"),
-                (await client.issue_token(AccessRole.TRAINER))[0],
-                [rollout_to_proto(rollout) for rollout in workload.rollouts],
-                join,
-            )
-            yield Field(
-                manager, target, client, workload, prepared_result(workload.rollouts[0].plan).reward.total
-            )
+            trainer_token = (await client.issue_token(AccessRole.TRAINER))[0]
+            rollouts = [rollout_to_proto(rollout) for rollout in workload.rollouts]
+            reward = prepared_result(workload.rollouts[0].plan).reward.total
+            yield Field(manager, Target(*target, trainer_token, rollouts, join), client, workload, reward)
 
 
 async def _ready(client: ClusterClient, names: tuple[str, ...]) -> None:
@@ -187,7 +197,7 @@ def _count(harm: Harm, results: list[RolloutResult], reward: float) -> None:
             harm.fabricated += not honest
 
 
-async def _honest_trainer(place: Field, harm: Harm, is_over: Callable[[], bool]) -> None:
+async def honest_trainer(place: Field, harm: Harm, is_over: Callable[[], bool]) -> None:
     """Submit batch after batch to a verified run until the attack is over, and check every result."""
     terms = RunTerms(GroupPolicy.PARTIAL, verified=True)
     run_id = await place.client.open_run("siege", "siege", terms)
@@ -202,7 +212,7 @@ async def _honest_trainer(place: Field, harm: Harm, is_over: Callable[[], bool])
         number += 1
 
 
-class _Watch:
+class Watch:
     """Samples of the manager's memory, as a context manager."""
 
     def __init__(self, process: Process) -> None:
@@ -225,7 +235,7 @@ class _Watch:
 
 
 @contextlib.asynccontextmanager
-async def _beside(*coroutines: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+async def beside(*coroutines: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
     """Run the coroutines beside the body and cancel them at its end. Raise the first error of theirs."""
     tasks = [asyncio.create_task(each) for each in coroutines]
     try:
@@ -245,7 +255,7 @@ async def besiege(place: Field, messages: int, seed: int, limit_s: float = 60.0)
     The attack ends early after ``limit_s`` seconds, or when the manager ends.
     """
     harm, fight = Harm(), Fight(messages)
-    watch = _Watch(place.manager)
+    watch = Watch(place.manager)
     ends_s = time.monotonic() + limit_s
     foreign: deque[Any] = deque(maxlen=64)
 
@@ -259,13 +269,13 @@ async def besiege(place: Field, messages: int, seed: int, limit_s: float = 60.0)
         browser(place.target, fight, seed),
         stranger(place.target, fight, seed),
     )
-    async with _beside(watch.sample(), *map(_repeated, attacks)):
+    async with beside(watch.sample(), *map(_repeated, attacks)):
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(limit_s + START_S):
-                await _honest_trainer(place, harm, is_over)
+                await honest_trainer(place, harm, is_over)
     harm.manager_deaths = int(place.manager.child.poll() is not None)
     harm.rss_growth_mb, harm.internal = watch.growth_mb, fight.internal.total()
-    await asyncio.to_thread(_read_state, place, harm)
+    await asyncio.to_thread(read_state, place, harm)
     return harm, fight
 
 
@@ -275,7 +285,7 @@ async def _repeated(attack: Coroutine[Any, Any, None]) -> None:
         await attack
 
 
-def _read_state(place: Field, harm: Harm) -> None:
+def read_state(place: Field, harm: Harm) -> None:
     """Read the lists and metrics that operators see. NaN is no JSON."""
     for path in ("/api/v1/snapshot", "/api/v1/workers", "/api/v1/runs"):
         try:
@@ -304,7 +314,7 @@ async def tempt(place: Field, rollouts: int, *, verified: bool) -> Harm:
     harm = Harm()
     run_id = f"lies-{verified}"
     await place.client.open_run(run_id, run_id, RunTerms(GroupPolicy.PARTIAL, verified=verified))
-    async with _beside(fast_liar(place.target, f"liar-{run_id}")):
+    async with beside(fast_liar(place.target, f"liar-{run_id}")):
         await _ready(place.client, (f"liar-{run_id}",))
         batch = _batch(place, run_id, 0, rollouts)
         harm.submitted = len(batch.rollouts)
@@ -327,15 +337,15 @@ def bench_adversary(
 
 def run_siege(workload: Workload, sizes: SiegeSizes) -> tuple[Harm, Fight]:
     """Return the harm of a siege, and the messages of the attackers."""
-    return _alone(_siege, workload, sizes)
+    return run_alone(_siege, workload, sizes)
 
 
 def run_temptation(workload: Workload, sizes: SiegeSizes, verified: bool) -> Harm:
     """Return the harm of a fast liar beside two honest workers."""
-    return _alone(_temptation, workload, sizes, verified)
+    return run_alone(_temptation, workload, sizes, verified)
 
 
-def _alone(work: Callable[..., ResultT], *arguments: Any) -> ResultT:
+def run_alone(work: Callable[..., ResultT], *arguments: Any) -> ResultT:
     """Run the function in a fresh process. One with gRPC's threads must not fork the processes of a cluster."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(work, *arguments).result()
@@ -343,7 +353,7 @@ def _alone(work: Callable[..., ResultT], *arguments: Any) -> ResultT:
 
 def _siege(workload: Workload, sizes: SiegeSizes) -> tuple[Harm, Fight]:
     async def measure() -> tuple[Harm, Fight]:
-        with _folder() as folder:
+        with temporary_folder() as folder:
             async with battlefield(folder, workload) as place:
                 harm, fight = await besiege(place, sizes.messages, sizes.seed, sizes.limit_s)
                 harm.last_words = place.manager.log.read_text(errors="replace")[-LAST_WORDS:]
@@ -354,7 +364,7 @@ def _siege(workload: Workload, sizes: SiegeSizes) -> tuple[Harm, Fight]:
 
 def _temptation(workload: Workload, sizes: SiegeSizes, verified: bool) -> Harm:
     async def measure() -> Harm:
-        with _folder() as folder:
+        with temporary_folder() as folder:
             async with battlefield(folder, workload, "--audit") as place:
                 return await tempt(place, sizes.lies, verified=verified)
 
@@ -362,7 +372,7 @@ def _temptation(workload: Workload, sizes: SiegeSizes, verified: bool) -> Harm:
 
 
 @contextlib.contextmanager
-def _folder() -> Iterator[Path]:
+def temporary_folder() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name:
         yield Path(name)
 
