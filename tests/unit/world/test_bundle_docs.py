@@ -50,8 +50,8 @@ def value_of(kind: shapes.Type) -> str:
     match kind:
         case shapes.StrType(pattern=str()):
             return "name"
-        case shapes.StrType():
-            return "text"
+        case shapes.StrType(max_length=most):
+            return "text" if most is None else f"text, at most {most:,} characters"
         case shapes.BoolType():
             return "true or false"
         case shapes.FloatType() | shapes.IntType():
@@ -70,8 +70,9 @@ def value_of(kind: shapes.Type) -> str:
             return "row of `poses`"
         case shapes.UnionType(types=types):
             return value_of(next(kind for kind in types if not isinstance(kind, shapes.IntType)))
-        case shapes.DictType(key_type=key, value_type=value):
-            return f"map of {value_of(key)} to: {value_of(value)}"
+        case shapes.DictType(key_type=key, value_type=value, max_length=most):
+            limit = "" if most is None else f"; at most {most:,} keys"
+            return f"map of {value_of(key)} to: {value_of(value)}{limit}"
         case shapes.VarTupleType() | shapes.ListType():
             return list_of(kind)
     raise AssertionError(f"the page has no words for {kind}")
@@ -124,6 +125,7 @@ def test_page_lists_the_limits_with_their_values():
     assert {name: float(value) for name, value in written.items()} == {
         "compressed_bytes": DEFAULT_LIMITS.compressed_bytes,
         "ratio": DEFAULT_LIMITS.ratio,
+        "content_bytes": DEFAULT_LIMITS.content_bytes,
         "values": DEFAULT_LIMITS.values,
     }
 
