@@ -16,6 +16,7 @@ from tests.fuzz.decoder import Decoder, in_file, mutate_bytes, mutate_json, muta
 from tests.fuzz.world import record_line
 
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
+from embomatrix.factory.evaluate.faithfulness import read_answers
 from embomatrix.factory.evaluate.judges import DiversityScores, Impression
 from embomatrix.factory.evaluate.room_plans import read_rooms
 from embomatrix.factory.evaluate.scenes import LayoutMethod, LayoutOutcome, outcome_log
@@ -230,6 +231,10 @@ def _rooms(data: bytes) -> object:
     return read_rooms(in_file("rooms.json.gz", packed))
 
 
+def _policy_answers(data: bytes) -> object:
+    return read_answers(in_file("answers.jsonl", data))
+
+
 def _ledger(data: bytes) -> object:
     """Evaluate a build's ledger: drafts, times and settings, with 0 bytes between."""
     drafts, times, settings = (*data.split(b"\x00", 2), b"", b"")[:3]
@@ -390,6 +395,13 @@ def table() -> dict[str, Decoder]:
             (EvaluationError,),
             lambda: (rooms, gzip.compress(rooms)),
             frozenset({"factory.evaluate.room_plans:read_rooms"}),
+            mutate_json,
+        ),
+        "answers to audit": Decoder(
+            _policy_answers,
+            (DatasetError,),
+            lambda: (b'{"codec": "json"}\n{"task_id": "t", "text": "[]"}', b'{"codec": "names"}\n\n[1]'),
+            frozenset({"factory.evaluate.faithfulness:read_answers"}),
             mutate_json,
         ),
         "ledger of a build": Decoder(

@@ -915,7 +915,7 @@ CALLS = (
         "run with a negative weight",
         lambda: run_terms_from_proto(rollout_service_pb2.OpenRunRequest(name="n", weight=-1.0)),
         "weight: found -1.0",
-        "expected 0 or more",
+        "expected 0.001 or more",
     ),
     CallCase(
         "reward that is not finite",

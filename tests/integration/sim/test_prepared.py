@@ -15,6 +15,7 @@ from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.live_world import prepare
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
+from embomatrix.world.goal import Atom
 
 PLANS = (
     "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop",
@@ -28,7 +29,7 @@ PLANS = (
 def bundle():
     """Bundle of the flat, prepared by a used simulator and decoded from bytes."""
     scene = kitchen_scene()
-    task = task_over(scene)
+    task = task_over(scene, Atom("open", ("fridge_1",)))
     bare = Bundle(scene, {task.task_id: task})
     with contextlib.closing(load_simulator(bare)) as simulator:
         simulator.execute(task, plan_of(task, PLANS[0]), 0)

@@ -122,6 +122,8 @@ class _Context:
     def __init__(self, token: str, written: _Written) -> None:
         self._metadata = ((TOKEN_KEY, bearer(token)),) if token else ()
         self._written = written
+        self._code: grpc.StatusCode | None = None
+        self._details = ""
 
     def invocation_metadata(self) -> Sequence[tuple[str, str]]:
         return self._metadata
@@ -132,6 +134,22 @@ class _Context:
     async def abort(self, code: grpc.StatusCode, details: str = "", trailing_metadata: Any = ()) -> None:
         del trailing_metadata
         raise CallRefusedError(code, details)
+
+    def set_trailing_metadata(self, trailing_metadata: Any) -> None:
+        """Ignore what tells clients the reason."""
+
+    def set_code(self, code: grpc.StatusCode) -> None:
+        self._code = code
+
+    def set_details(self, details: str) -> None:
+        self._details = details
+
+    def end(self, answer: Any = None) -> None:
+        """End the call with its answer, if it has one. Raise CallRefusedError if its service set a code."""
+        if self._code is not None:
+            raise CallRefusedError(self._code, self._details)
+        if answer is not None:
+            self._written.add(answer)
 
 
 @dataclass(frozen=True)
@@ -261,7 +279,8 @@ class ManagerInside:
                 written.add(answer)
         else:
             serve = handler.stream_unary if handler.request_streaming else handler.unary_unary
-            written.add(await serve(request, context))
+            context.end(await serve(request, context))
+        context.end()
 
     async def _handler(self, details: _Details) -> grpc.RpcMethodHandler:
         async def known(found: _Details) -> grpc.RpcMethodHandler:

@@ -1,7 +1,6 @@
 """Audit of a dataset: instructions against goals, and a search for plans that succeed against the instruction."""
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json
 from embomatrix.skills.prompt import Codec, situation_of, with_indices
 from embomatrix.skills.syntax import Plan
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
@@ -130,9 +130,9 @@ def audit_task(
 def read_answers(path: Path) -> PolicyAnswers:
     """Read the stored answers of an evaluation. Raise DatasetError for another file, OSError."""
     codec, texts = Codec.JSON, dict[str, list[str]]()
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         try:
-            value = json.loads(line)
+            value = parse_json(line)
             if number == 1:
                 codec = Codec(value["codec"])
             else:
