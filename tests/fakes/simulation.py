@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 import zlib
+from pathlib import Path
 
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.wire.values import Completed, Timings
@@ -36,6 +37,13 @@ class FakeSimulation:
             case "large":
                 return FakeScene(ballast=bytearray(os.urandom(1) * (40 * 1024 * 1024)))
         return FakeScene()
+
+
+def _meet(folder):
+    """Wait until two executions are here at once."""
+    (folder / f"{os.getpid()}.here").touch()
+    while len(list(folder.glob("*.here"))) < 2:
+        time.sleep(0.01)
 
 
 def _word_in(path):
@@ -73,6 +81,8 @@ class FakeScene:
                 time.sleep(600)
             case "slow":
                 time.sleep(0.3)
+            case str() as task if task.startswith("meet "):
+                _meet(Path(task.removeprefix("meet ")))
             case "steps":
                 for number in range(2, 40):
                     time.sleep(0.05)
