@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
 
 
 def check(seed, steps, workload, folder):
-    """Play a sequence; on a failure, ``python -m embomatrix.bench.adversary.sequences SEED STEPS`` shows its steps."""
+    """Play a sequence. ``python -m embomatrix.bench.adversary.sequences SEED STEPS`` shows the steps of a failed one."""
     played = play_seed(seed, steps, workload, folder)
     assert played.tracebacks == [], (seed, played.steps)
     assert "INTERNAL" not in played.statuses, (seed, played.steps)

@@ -187,7 +187,7 @@ def _mutate_row(data: bytes, rng: random.Random) -> bytes:
 
 
 def _archive(data: bytes) -> object:
-    """Read an archived run whose unpacked message these bytes are; if they are gzip, the file itself."""
+    """Read an archived run. The bytes are its unpacked message, or in gzip format the file itself."""
     packed = data if data[:2] == b"\x1f\x8b" else gzip.compress(data, 1)
     path = in_file(f"runs/run-1{SUFFIX}", packed)
     return RunArchive(path.parent).load("run-1")
@@ -205,12 +205,12 @@ def _archived() -> list[bytes]:
 
 
 class _RefusedError(Exception):
-    """Exit of a command with a sentence."""
+    """Exit of a command that printed a sentence."""
 
 
 @contextlib.contextmanager
 def _sentences() -> Iterator[None]:
-    """Turn the exit of a command into an exception, without its output. A sentence exits with status 2."""
+    """Turn the exit of a command into an exception, without its output. Status 2 means that it printed a sentence."""
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
         try:
             yield

@@ -25,7 +25,7 @@ class SlowError(AssertionError):
 
 @dataclass(frozen=True)
 class Decoder:
-    """``decode`` also does the next things that the program does with the value, such as encoding it again.
+    """Decoder and its inputs. ``decode`` also does with the value what the program does next, such as encoding it again.
 
     ``reads`` names the functions with a parsing call that ``seeds`` reach, as ``module:qualified name``.
     """
@@ -38,7 +38,7 @@ class Decoder:
     most_s: float = MOST_S
 
     def check(self, data: bytes) -> type[BaseException] | None:
-        """Decode the input; return the type of a documented error. Other errors pass, slow inputs raise SlowError."""
+        """Decode the input; return the type of a documented error. Other errors are raised, and SlowError for slow inputs."""
         began_s = time.process_time()
         found: type[BaseException] | None = None
         try:
@@ -68,7 +68,7 @@ def in_file(name: str, data: bytes) -> Path:
 
 
 def text_of(data: bytes) -> str:
-    """Return any text; bytes that are no UTF-8 become half surrogates, as escapes in JSON do."""
+    """Return the bytes as text. Bytes that are not UTF-8 become lone surrogates, as JSON escapes can."""
     return data.decode("utf-8", "surrogateescape")
 
 
@@ -113,7 +113,7 @@ def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
 
 
 def mutate_json(data: bytes, rng: random.Random) -> bytes:
-    """Return JSON text with one value replaced, dropped, repeated or renamed; damaged text now and then."""
+    """Return JSON text with one value replaced, dropped, repeated or renamed, or now and then damaged text."""
     if rng.random() < 0.2:
         return mutate_bytes(data, rng)
     try:

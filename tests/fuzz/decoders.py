@@ -1,7 +1,7 @@
 """Table of every decoder: code that turns bytes or text of another machine or person into values.
 
-``OWN`` lists the functions with a parsing call that read nothing of the kind. Together they name every such function of the
-source code, so a new one can't be forgotten.
+``OWN`` lists the functions with a parsing call that read no such bytes. The table and ``OWN`` together name every function
+with a parsing call in the source code, so a new one can't be forgotten.
 """
 
 from __future__ import annotations

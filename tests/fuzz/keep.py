@@ -1,4 +1,4 @@
-"""Keep the found inputs that reach lines no known input reaches: ``python -m tests.fuzz.keep [NAME ...]``.
+"""Keep the found inputs that reach lines which no known input reaches: ``python -m tests.fuzz.keep [NAME ...]``.
 
 It reads ``build/fuzz`` and rewrites ``tests/fuzz/corpus``, the smallest inputs first.
 """

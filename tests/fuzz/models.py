@@ -120,7 +120,7 @@ class _Parrot:
 
 
 def _layout_answer(data: bytes) -> object:
-    """Lay out a room with a model that answers with this text; rules replace unusable answers."""
+    """Lay out a room with a model that gives this text as its answer; rules replace unusable answers."""
     logging.getLogger("embomatrix.factory.layout").setLevel(logging.ERROR)
     with ModelLayoutAgents(_Parrot(text_of(data)), attempts=1) as agents:
         spread = agents.distribute(SPREAD_BRIEF)
@@ -226,7 +226,7 @@ def _evaluation(data: bytes) -> object:
 
 
 def _rooms(data: bytes) -> object:
-    """Read a table of rooms with this JSON; gzip is the file itself."""
+    """Read a table of rooms. The bytes are its JSON, or in gzip format the file itself."""
     packed = data if data[:2] == b"\x1f\x8b" else gzip.compress(data, 1)
     return read_rooms(in_file("rooms.json.gz", packed))
 
@@ -236,7 +236,7 @@ def _policy_answers(data: bytes) -> object:
 
 
 def _ledger(data: bytes) -> object:
-    """Evaluate a build's ledger: drafts, times and settings, with 0 bytes between."""
+    """Evaluate a build's ledger: drafts, times and settings, separated by zero bytes."""
     drafts, times, settings = (*data.split(b"\x00", 2), b"", b"")[:3]
     folder = in_file(f"ledger/{ATTEMPTS_FILE}", drafts).parent
     in_file(f"ledger/{TIMES_FILE}", times)
@@ -452,7 +452,7 @@ def table() -> dict[str, Decoder]:
 
 
 def _mutate_parts(data: bytes, rng: random.Random) -> bytes:
-    """Apply ``mutate_json_lines`` to one of the parts between 0 bytes."""
+    """Apply ``mutate_json_lines`` to one of the parts that zero bytes separate."""
     parts = data.split(b"\x00")
     at = rng.randrange(len(parts))
     parts[at] = mutate_json_lines(parts[at], rng)

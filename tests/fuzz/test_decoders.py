@@ -43,7 +43,7 @@ ODD = (
     b"\x1f\x8b" + bytes(40),
     b"PK\x03\x04" + bytes(40),
 )
-"""Inputs that broke one decoder or another."""
+"""Inputs that broke some decoder."""
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # damaged numbers of meshes

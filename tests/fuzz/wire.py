@@ -1,7 +1,7 @@
 """Decoders of every message of the protocol: requests at the manager, answers at workers, trainers and operators.
 
-The first byte of an input selects the type of the message. A converted value is written and read once more, as the next
-machine does.
+The first byte of an input selects the type of the message. A converted value is written and read once more, as by the next
+machine.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ ROLLOUT = Rollout("r-1", "g-1", "sha256:" + "0" * 64, "open-fridge", PLAN, 3)
 
 
 def _again(convert: Callable[[Any], Any], back: Callable[[Any], Message]) -> Use:
-    """Return the use of a message: convert it, write the value, and convert the written message."""
+    """Return a function that converts a message, writes the value, and converts the written message."""
 
     def use(message: Message) -> object:
         value = convert(message)
@@ -200,7 +200,7 @@ def _answer(kinds: Sequence[type[Message]], data: bytes) -> object:
 
 
 def _mutate(kinds: Sequence[type[Message]], data: bytes, rng: random.Random) -> bytes:
-    """Return a message with one field of it or of a part replaced by a random one; garbled bytes now and then."""
+    """Return a message in which one field, its own or that of a part, is random, or now and then garbled bytes."""
     if not data or rng.random() < 0.2:
         return mutate_bytes(data, rng)
     kind = kinds[data[0] % len(kinds)]

@@ -55,7 +55,7 @@ class Nothing:
 
 
 def use_goal(goal: Formula, types: Mapping[str, Sequence[str]]) -> None:
-    """Do with a goal what rollouts do: name its objects, its scored atoms, and evaluate it."""
+    """Use a goal as rollouts do: list its objects and its scored atoms, and evaluate it."""
     objects_of(goal, types)
     for atom in scored_atoms(goal, types):
         render(atom)
@@ -68,7 +68,7 @@ def use_task(task: Task) -> None:
 
 
 def use_plan(plan: Plan) -> None:
-    """Do with a plan what trainers do: send it, log it, and show it."""
+    """Use a plan as trainers do: send it, log it, and show it."""
     messages = [skill_call_to_proto(call) for call in plan]
     again = tuple(skill_call_from_proto(type(each).FromString(each.SerializeToString())) for each in messages)
     assert again == plan
@@ -222,7 +222,7 @@ def _problem_lines(data: bytes) -> object:
 
 
 def _eai(data: bytes) -> object:
-    """Read EAI's tasks from its table of tasks, its table of instructions, and one problem, with 0 bytes between."""
+    """Read EAI's tasks from its table of tasks, its table of instructions, and one problem, separated by zero bytes."""
     stats, words, problem = (*data.split(b"\x00", 2), b"", b"")[:3]
     folder = in_file("eai/data/demo_stats.json", stats).parents[1]
     for name, content in (

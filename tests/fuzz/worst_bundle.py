@@ -30,7 +30,7 @@ Arrays = dict[str, bytes]
 SHAPES: Final = {"poses": 7, "parts": 10, "kinds": 2, "vertices": 3, "stands": 3, "sets": 5, "spots": 7}
 """Columns of the arrays of a bundle."""
 FREE: Final = 1_000_000
-"""Bytes of content that need no compressed ones."""
+"""Bytes of content that are allowed beyond the ratio to the compressed bytes, rounded down."""
 WIDTHS: Final = {"kinds": 4, "sets": 4}
 """Bytes of a number, 8 in the other arrays."""
 
@@ -60,7 +60,7 @@ def _small() -> tuple[Head, Arrays]:
 
 
 def packed(head: Head, arrays: Arrays) -> bytes:
-    """Return the compressed bundle. Noise in a text at its beginning keeps every part of it within the ratio."""
+    """Return the compressed bundle. Random characters in a text at its beginning keep every part of it within the ratio."""
     for name, data in arrays.items():
         width = WIDTHS.get(name, 8)
         rows = len(data) // width // SHAPES[name]
@@ -185,7 +185,7 @@ def _assets(head: Head, arrays: Arrays, count: int) -> None:
 
 
 def _objects(head: Head, arrays: Arrays, count: int) -> None:
-    """Objects outside the world need no place of their own."""
+    """Objects outside the world, which need no place of their own."""
     del arrays
     thing = head["scene"]["objects"][1]
     head["scene"]["objects"] += [
@@ -299,7 +299,7 @@ def measured(mixture: Mapping[str, int]) -> Growth:
 
 
 def most_of(kind: str, others: Mapping[str, int] | None = None, largest: int = 1 << 25) -> int:
-    """Return the most elements of a kind that a bundle may have beside others, to a few per cent."""
+    """Return the largest number of elements of a kind that a bundle may have beside others, to a few per cent."""
     low, high = 0, 64
     while high <= largest and _fits({**(others or {}), kind: high}):
         low, high = high, high * 2

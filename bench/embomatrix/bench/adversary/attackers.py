@@ -1,4 +1,4 @@
-"""Attackers: they send strikes of random kinds to a manager, and count what they sent and every answer."""
+"""Attackers that send strikes of random kinds to a manager, and count their messages and the answers."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Target:
 
 @dataclass
 class Fight:
-    """Messages by kind, and answers by status. The attackers end once ``most`` messages were sent."""
+    """Messages by kind, and answers by status. The attackers stop once ``most`` messages were sent."""
 
     most: int
     sent: Counter[str] = field(default_factory=Counter)
@@ -107,7 +107,7 @@ def _opened(
 async def _call(
     channel: grpc.aio.Channel, token: str, kind: Kind, payloads: Sequence[bytes], fight: Fight
 ) -> None:
-    """Send the payloads as one call of any shape and read its answers for a while."""
+    """Send the payloads as one call of any shape and read its answers for at most ``ANSWER_S`` seconds."""
     fight.sent[kind.name] += len(payloads)
     call = _opened(channel, kind.method, token, ANSWER_S)
     try:
@@ -196,8 +196,8 @@ async def hostile_worker(
 ) -> None:
     """Register, hold scenes, and send any messages; register again after each end of the session.
 
-    ``foreign`` collects the leases of all workers that share it. A worker that is refused takes a new name with a new token:
-    a person with many tokens is worse than a quarantined one.
+    ``foreign`` collects the leases of all workers that share it. A worker that is refused takes a new name with a new token,
+    since an attacker with many tokens does more harm than one quarantined worker.
     """
     rng = random.Random(seed)
     shared = deque(maxlen=64) if foreign is None else foreign
@@ -231,7 +231,7 @@ async def _register(
 async def _fight_in_session(
     channel: grpc.aio.Channel, known: Knowledge, arsenal: Arsenal, rng: random.Random, fight: Fight
 ) -> None:
-    """Send strikes in one session until the manager ends it, or enough were sent."""
+    """Send strikes in one session until the manager ends it, or ``STRIKES_PER_SESSION`` were sent."""
     maker = MessageMaker(rng, [known.session_id, known.worker_id, known.run_id])
     stream = _opened(channel, SESSION, known.token)
     kind = KINDS["any Session"]

@@ -52,7 +52,7 @@ T = TypeVar("T")
 
 
 class _Selector(selectors.SelectSelector):
-    """Counts the time for which a loop would wait, instead of waiting."""
+    """Selector that adds up the time for which a loop would wait, instead of waiting."""
 
     passed_s = 0.0
 
@@ -64,7 +64,7 @@ class _Selector(selectors.SelectSelector):
 
 
 class _Loop(asyncio.SelectorEventLoop):
-    """Event loop whose time passes when nothing else is left to do."""
+    """Event loop whose clock advances only when nothing is ready to run."""
 
     def __init__(self) -> None:
         self._clock = _Selector()
@@ -76,7 +76,7 @@ class _Loop(asyncio.SelectorEventLoop):
 
 
 class _NoThreads(ThreadPoolExecutor):
-    """Calls each function at once."""
+    """Executor that calls each function at once, in the same thread."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -90,7 +90,7 @@ class _NoThreads(ThreadPoolExecutor):
 def run_in_order(main: Coroutine[Any, Any, T]) -> T:
     """Run the coroutine like ``asyncio.run``, in an order that neither threads nor the duration of a call change.
 
-    Sleeping takes no time. ``sleep(0.001)`` returns when the other tasks wait for something.
+    Sleeping takes no real time. ``sleep(0.001)`` returns when all other tasks wait for something.
     """
     with asyncio.Runner(loop_factory=_Loop) as runner:
         return runner.run(main)
@@ -136,7 +136,7 @@ class _Context:
         raise CallRefusedError(code, details)
 
     def set_trailing_metadata(self, trailing_metadata: Any) -> None:
-        """Ignore what tells clients the reason."""
+        """Ignore the metadata, which tells clients the reason of a refusal."""
 
     def set_code(self, code: grpc.StatusCode) -> None:
         self._code = code
@@ -161,7 +161,7 @@ class _Details:
 
 
 class _Methods:
-    """Takes the place of a gRPC server: keeps the handler of each method."""
+    """Stand-in for a gRPC server that keeps the handler of each method."""
 
     def __init__(self) -> None:
         self.handlers: dict[str, grpc.RpcMethodHandler] = {}

@@ -1,4 +1,7 @@
-"""Kinds of hostile messages by actor. A kind makes the payloads of one strike from an attacker's knowledge."""
+"""Kinds of hostile messages by actor.
+
+A strike is one attack: a few payloads that a kind makes from an attacker's knowledge.
+"""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -122,7 +125,7 @@ def _large_call(_known: Knowledge, maker: MessageMaker) -> Sequence[Payload]:
 
 
 def unknown_field(maker: MessageMaker) -> bytes:
-    """Return a field of 30 kB that no version of the protocol has; messages keep it."""
+    """Return a field of 30 kB that no version of the protocol defines; parsed messages keep it."""
     text = maker.rng.randbytes(UNKNOWN_BYTES)
     # Number 127, length-delimited, and the length in three groups of seven bits.
     length = (UNKNOWN_BYTES & 0x7F | 0x80, UNKNOWN_BYTES >> 7 & 0x7F | 0x80, UNKNOWN_BYTES >> 14)

@@ -57,9 +57,9 @@ STREAMS: Final = 3
 FINISH_S: Final = 20.0
 """Time for the honest run after the last hostile message."""
 PAUSES_S: Final = (0.0, 0.001, 0.001, 0.001, 0.05)
-"""Times after a message: none, until the manager is idle, and until honest workers have answered. See ``run_in_order``."""
+"""Pauses after a message: none, until the manager is idle, or until honest workers have answered. See ``run_in_order``."""
 LARGE: Final = 200_000
-"""Bytes of a strike that is skipped: siege sends megabytes."""
+"""Strikes with more bytes than this are skipped. The siege sends them."""
 
 
 @dataclass
@@ -126,7 +126,7 @@ class _Stage:
         self.digests = sorted({rollout.bundle_digest for rollout in self.rollouts})
         self.foes: list[_Foe] = []
         self.trainer = Knowledge(run_id="hostile", rollouts=self.rollouts)
-        # It does not know the honest run: the token of any trainer may close any run.
+        # It does not know the id of the honest run, since any trainer's token may close any run.
         self.trainer_maker = MessageMaker(rng, ["hostile", self.rollouts[0].bundle_digest])
         self.ended: Counter[str] = Counter()
         """Number of times that the manager ended a session after a message, by its kind."""
@@ -139,7 +139,7 @@ class _Stage:
         return (await self.manager.gate.issue(AccessRole.JOIN, valid_s=600.0, label=""))[0]
 
     async def enter(self) -> None:
-        """Let the hostile workers and the hostile trainer in."""
+        """Open the hostile trainer's run and register the hostile workers."""
         self.trainer.token = (await self.manager.gate.issue(AccessRole.TRAINER, valid_s=0.0, label=""))[0]
         opening = rollout_service_pb2.OpenRunRequest(
             name="hostile", run_id="hostile", protocol_version=PROTOCOL_VERSION
@@ -152,7 +152,7 @@ class _Stage:
             await self._register(foe)
 
     async def _register(self, foe: _Foe) -> None:
-        """Register under the foe's name, with its credential or a new invitation."""
+        """Register under the foe's name, with its credential or a new join token."""
         invitation = "" if foe.known.token else await self.join()
         request = sound_registration(foe.known, invitation)
         status, answers = await self.manager.call(
@@ -186,7 +186,7 @@ class _Stage:
         self.manager.runtime.cluster.check_invariants()
 
     def _session_kind(self) -> Kind:
-        """Draw a kind of message. Those that end sessions are rarer, so that others follow in the same one."""
+        """Draw a kind of message. Kinds that ended sessions are drawn less often, so that sessions last longer."""
         weights = [1 / (1 + self.ended[kind.name]) for kind in self.session_kinds]
         return self.rng.choices(self.session_kinds, weights)[0]
 
@@ -319,7 +319,7 @@ def _count(played: Played, result: RolloutResult) -> None:
 
 
 async def provoke(rng: random.Random, steps: int, workload: Workload, folder: Path) -> Played:
-    """Play so many hostile steps. Raise AssertionError if the manager's state contradicts itself."""
+    """Play ``steps`` hostile steps. Raise AssertionError if the manager's state contradicts itself."""
     async with _entered(rng, workload, folder) as stage:
         for _step in range(steps):
             await stage.step()
@@ -329,7 +329,7 @@ async def provoke(rng: random.Random, steps: int, workload: Workload, folder: Pa
 
 @contextlib.asynccontextmanager
 async def _entered(rng: random.Random, workload: Workload, folder: Path) -> AsyncIterator[_Stage]:
-    """Start a manager with the scenes of the first rollouts, and let the attackers in."""
+    """Start a manager with the scenes of the first rollouts, and connect the attackers."""
     played = Played()
     async with manager_inside(folder) as manager:
         played.tracebacks = manager.tracebacks
@@ -343,7 +343,7 @@ async def _entered(rng: random.Random, workload: Workload, folder: Path) -> Asyn
 
 
 async def play(rng: random.Random, steps: int, workload: Workload, folder: Path) -> Played:
-    """Play so many hostile steps beside an honest run, expel the attackers, and let the run finish.
+    """Play ``steps`` hostile steps beside an honest run, expel the attackers, and let the run finish.
 
     Raise AssertionError if the manager's state contradicts itself, or if an honest worker is expelled.
     """
@@ -371,7 +371,7 @@ async def _chunks(data: bytes) -> AsyncIterator[bytes]:
 
 
 def play_seed(seed: int, steps: int, workload: Workload, folder: Path) -> Played:
-    """Play the sequence of a seed."""
+    """Play the sequence that the seed gives."""
     return run_in_order(play(random.Random(seed), steps, workload, folder))
 
 

@@ -1,4 +1,4 @@
-"""Search for plans that earn full reward against the instruction, on tasks that the factory makes for it."""
+"""Search for plans that succeed although they violate the instruction, on tasks that the factory builds for the search."""
 
 import math
 import tempfile

@@ -1,4 +1,4 @@
-"""`bench adversary`: a manager with honest workers and an honest trainer under attack, measured.
+"""Siege of `bench adversary`: attacks on a manager with honest workers and an honest trainer, and their measured harm.
 
 Every attacker has a token of its own role. Honest results are known in advance, so each delivered result is checked.
 """
@@ -66,7 +66,7 @@ OPENER: Final = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 @dataclass(frozen=True, slots=True)
 class SiegeSizes:
-    """``messages`` hostile messages, then ``lies`` rollouts of each run beside a fast liar."""
+    """Sizes of a siege: ``messages`` hostile messages, then ``lies`` rollouts in each run beside a fast liar."""
 
     messages: int = 110_000
     lies: int = 600
@@ -107,7 +107,7 @@ class Harm:
 
 @dataclass
 class Field:
-    """Manager with honest workers, its scenes uploaded."""
+    """Manager with honest workers and uploaded scenes."""
 
     manager: Process
     target: Target
@@ -142,7 +142,10 @@ def admin_token(folder: Path) -> str:
 async def occupied(
     folder: Path, manager: Process, addresses: str, target: tuple[str, str], workload: Workload, honest: int
 ) -> AsyncIterator[Field]:
-    """Start honest workers that know the ``addresses``, and upload the scenes. ``target`` is attacked, gRPC and HTTP."""
+    """Start honest workers that know the ``addresses``, and upload the scenes.
+
+    ``target`` holds the gRPC and the HTTP address that the attackers use.
+    """
     with contextlib.ExitStack() as processes:
         tokens = {f"honest-{number}": folder / f"{number}.token" for number in range(1, honest + 1)}
         for name, file in tokens.items():
@@ -236,7 +239,7 @@ class Watch:
 
 @contextlib.asynccontextmanager
 async def beside(*coroutines: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-    """Run the coroutines beside the body and cancel them at its end. Raise the first error of theirs."""
+    """Run the coroutines beside the body and cancel them at its end. Raise the first of their errors."""
     tasks = [asyncio.create_task(each) for each in coroutines]
     try:
         yield
@@ -280,13 +283,13 @@ async def besiege(place: Field, messages: int, seed: int, limit_s: float = 60.0)
 
 
 async def _repeated(attack: Coroutine[Any, Any, None]) -> None:
-    """Run an attack to its end. A dead manager ends it too, and counts elsewhere."""
+    """Run an attack to its end. The death of the manager ends it too; it is counted elsewhere."""
     with contextlib.suppress(ClusterError, OSError):
         await attack
 
 
 def read_state(place: Field, harm: Harm) -> None:
-    """Read the lists and metrics that operators see. NaN is no JSON."""
+    """Read the lists and metrics that operators see. A list with NaN counts as unreadable: NaN is not valid JSON."""
     for path in ("/api/v1/snapshot", "/api/v1/workers", "/api/v1/runs"):
         try:
             json.loads(_page(place, path), parse_constant=_refuse)
@@ -310,7 +313,7 @@ def _page(place: Field, path: str) -> str:
 
 
 async def tempt(place: Field, rollouts: int, *, verified: bool) -> Harm:
-    """Execute a run beside a fast liar and close it at once; return the made-up results that were delivered."""
+    """Execute a run beside a fast liar, close it at once, and count the made-up results that were delivered."""
     harm = Harm()
     run_id = f"lies-{verified}"
     await place.client.open_run(run_id, run_id, RunTerms(GroupPolicy.PARTIAL, verified=verified))
@@ -346,7 +349,7 @@ def run_temptation(workload: Workload, sizes: SiegeSizes, verified: bool) -> Har
 
 
 def run_alone(work: Callable[..., ResultT], *arguments: Any) -> ResultT:
-    """Run the function in a fresh process. One with gRPC's threads must not fork the processes of a cluster."""
+    """Run the function in a fresh process. A process with gRPC's threads must not fork the processes of a cluster."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(work, *arguments).result()
 

@@ -127,7 +127,7 @@ async def _besiege(pair: _Pair, duration_s: float, seed: int) -> Succession:
 
 
 async def _persistent(attack: Callable[[], Coroutine[Any, Any, None]], is_over: Callable[[], bool]) -> None:
-    """Attack again after each failure: the leader dies, and the standby refuses everything at first."""
+    """Attack again after each failure, since the leader dies and the standby refuses everything at first."""
     while not is_over():
         with contextlib.suppress(ClusterError, OSError):
             await attack()

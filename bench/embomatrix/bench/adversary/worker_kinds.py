@@ -57,7 +57,7 @@ def lie(lease: pb.Lease, held: int = 1, atoms: int = 2) -> pb.LeaseResult:
 
 
 def _random_lie(known: Knowledge, maker: MessageMaker) -> pb.LeaseResult:
-    """Return a lie about a lease that hardly any second liar repeats: two equal lies would outvote an honest worker."""
+    """Return a lie that a second liar hardly ever repeats, since two equal lies would outvote an honest worker."""
     atoms = maker.rng.randint(50, 90)
     return lie(_lease(known, maker), maker.rng.randrange(atoms), atoms)
 

@@ -1,7 +1,8 @@
 """Bounds of every field of the messages that a manager receives.
 
-``BOUNDS`` is the one table; ``docs/protocol.md`` lists it. A message is checked by its size before it is parsed and by its
-fields before it is converted, so no sender can make the manager hold, log or show a value that no sound sender has.
+``BOUNDS`` is the only table of bounds; ``docs/protocol.md`` lists it. A message is checked by its size before it is parsed
+and by its fields before it is converted, so no sender can make the manager hold, log or show a value that no sound sender
+sends.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ HELD_LEASES: Final = 4_096
 RESULT_BYTES: Final = 64 * 1024
 """Bytes of one result of a lease."""
 RESULT_TEXT: Final = 4_000
-"""Characters of a text in a result. A result of fewer bytes needs no look at its texts."""
+"""Characters of a text in a result. The texts of a result with fewer bytes need no check."""
 DAY_S: Final = 86_400.0
 
 
@@ -55,7 +56,7 @@ class Bound:
 
 
 def check_result(message: Message) -> None:
-    """Check the result of a lease like `check`. Texts and numbers of elements are examined in large results only.
+    """Check the result of a lease as `check` does. Texts and numbers of elements are examined in large results only.
 
     Numbers are checked by their conversion, and against the plan.
     """
@@ -374,7 +375,7 @@ def _number_rule(field: str, bound: Bound) -> Any:
 
 
 def _most_bytes(message: str) -> str:
-    """Return the limit of a request. Messages within it have none of their own."""
+    """Return the limit of a request in bytes. Messages inside a request have no limit of their own."""
     return f"{MESSAGE_BYTES.get(message, OTHER_BYTES):,}" if message.endswith("Request") else "–"
 
 

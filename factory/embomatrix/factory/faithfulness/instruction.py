@@ -102,7 +102,7 @@ def _alike(view: SceneView, names: Iterable[str]) -> Iterator[str]:
 
 
 def _wrong_preposition(text: str, clause: IntentClause, view: SceneView) -> Iterator[str]:
-    """Report a place that the words give another relation, and never the one that is scored."""
+    """Report a place if the words use the preposition of the other relation, and never that of the scored one."""
     nouns = "|".join(
         re.escape(noun)
         for noun in sorted({noun for name in clause.places for noun in nouns_of(view.category(name))})
@@ -120,9 +120,9 @@ def _wrong_preposition(text: str, clause: IntentClause, view: SceneView) -> Iter
 def _sources_named(
     text: str, clause: IntentClause, intent: Sequence[IntentClause], view: SceneView
 ) -> tuple[str, ...]:
-    """Return the objects of the scene that could bring a thermal state about, and that the words name for it.
+    """Return the objects that can cause the thermal state and that the words name as its source.
 
-    An object that the words name as the place of something is left out: *cook it and leave it in the oven*.
+    Objects that are places in the intent are left out, as in *cook it and leave it in the oven*.
     """
     state = State(clause.predicate)
     places = {name for other in intent for name in other.places}

@@ -1,6 +1,6 @@
 """Execution of a plan under watch: whether it reaches the goal, and which clauses of the intent it violates.
 
-The watch follows calls and sources, not the facts that the goal is scored by: a fault of these shows as a shortcut.
+The watch follows calls and sources, not the facts by which the goal is scored, so an error in those facts shows as a shortcut.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def watch(
 
 
 def _is_placed_otherwise(clause: IntentClause, placed: dict[str, tuple[str, str]]) -> bool:
-    """True if the last call that placed each of the things named a place of the clause with another relation."""
+    """True if every thing that was placed was last placed at a place of the clause with another relation."""
     last = [placed[thing] for thing in clause.things if thing in placed]
     return bool(last) and all(
         target in clause.places and relation != clause.predicate for relation, target in last

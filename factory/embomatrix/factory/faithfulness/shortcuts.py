@@ -1,7 +1,7 @@
 """Search for shortcuts: plans that succeed while they violate what the instruction states.
 
-A merely shorter plan is none. The search tries given plans, mutations of the oracle's plan, a greedy search over single
-actions by their reward, and random plans.
+A plan that is only shorter is not a shortcut. The search tries given plans, mutations of the oracle's plan, plans of a
+greedy search over single actions by their reward, and random plans.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def shortcut_in_words(report: SearchReport, table: Sequence[str]) -> str:
 
 
 class _Search:
-    """Plans tried so far. Nothing is executed twice, nor after the last plan."""
+    """Search with a limited number of plans. No plan is executed twice."""
 
     def __init__(
         self,
@@ -128,7 +128,7 @@ class _Search:
         return self._left <= 0
 
     def without_failures(self, plan: Plan) -> Plan:
-        """Return the calls of a plan that succeed one after the other: another object may need fewer calls."""
+        """Return the calls of a plan that succeed one after the other, since another object may need fewer calls."""
         self._simulator.reset(self._task, SEED)
         return tuple(call for call in plan if self._simulator.run_step(call).ok)
 
@@ -183,7 +183,7 @@ def _other_relations(oracle: Plan) -> Iterator[Plan]:
 
 
 def _dropped(oracle: Plan) -> Iterator[Plan]:
-    """Yield the plan without one of its calls, or without the calls from one to another."""
+    """Yield the plan without one of its calls, or without several calls in a row."""
     for low, high in itertools.combinations(range(len(oracle) + 1), 2):
         yield (*oracle[:low], *oracle[high:])
 

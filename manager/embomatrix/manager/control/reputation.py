@@ -1,7 +1,7 @@
 """Reputation of workers: choice of the results to audit, comparison of executions, and quarantine.
 
-A worker is on probation until ``AuditRules.probation`` of its executions were compared with another worker's. Later, a share
-of its results is compared, drawn by a keyed hash of the lease, which the worker cannot predict. Probation of 50 executions
+A worker is on probation until other workers have confirmed ``AuditRules.probation`` of its executions. Later, a share of its
+results is compared. A keyed hash of the lease, which the worker cannot predict, selects them. Probation of 50 executions
 catches 1 - 0.9^50 = 99.5 % of the workers that falsify a tenth of their results (acceptance test A17).
 """
 
@@ -21,9 +21,9 @@ REWARD_DIGITS: Final = 6
 """Decimal places to which rewards of different platforms are compared: they are sums of the same few terms."""
 TEXT_CHARS: Final = 8_192
 TEXT_RATIO: Final = 4
-"""Texts of one execution may have this many characters more than ``TEXT_RATIO`` times those of another."""
+"""Texts of one execution may have ``TEXT_RATIO`` times the characters of another's, plus ``TEXT_CHARS``."""
 OPINIONS: Final = 3
-"""Executions after which a case without two that agree is given up."""
+"""Number of executions after which a case is given up if no two of them agree."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +47,11 @@ class AuditRules:
 
 @dataclass(frozen=True, slots=True)
 class Opinion:
-    """Comparable digest of one execution. Across platforms only ``facts`` is compared."""
+    """Comparable digest of one execution. ``trace`` is compared on equal platforms only."""
 
     worker_id: str
     platform: Mapping[str, str]
-    """Versions of the worker. Without a fingerprint, its platform equals no other."""
+    """Versions of the worker. Without a platform fingerprint among them, ``trace`` is not compared."""
     trace: tuple[str, float, float, float]
     """Digest of the trace, and the exact three tiers of the reward."""
     facts: str
@@ -69,7 +69,7 @@ class Opinion:
 
 
 def opinion_of(worker_id: str, platform: Mapping[str, str], completed: Completed) -> Opinion:
-    """Return the comparable part of a result: without durations, and of texts only their length."""
+    """Return the comparable part of a result. It has no durations, and only the total length of the sentences."""
     reward = completed.reward
     tiers = (reward.format, reward.relevance, reward.goal)
     facts = (
@@ -118,7 +118,7 @@ class Reputation:
     mismatches: int = 0
     """Audited executions that were wrong."""
     quarantine: str = ""
-    """Reason of its quarantine; empty if it is in none."""
+    """Reason of its quarantine; empty if it is not in quarantine."""
 
 
 class Auditor:
@@ -146,7 +146,7 @@ class Auditor:
         return list(changed)
 
     def forget_blank(self, worker_id: str) -> None:
-        """Drop the reputation of a worker that left before it had one: names cost a worker nothing."""
+        """Drop an empty record of a worker that left. New names are free, so such records could fill the memory."""
         if self._reputations.get(worker_id) == Reputation():
             del self._reputations[worker_id]
 

@@ -29,7 +29,7 @@ LOOKED_AT: Final = 256
 
 
 def finish(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> None:
-    """End a rollout with its outcome, or a check with what it says about its case."""
+    """Deliver the outcome of a rollout, or use the outcome of a check to decide its case."""
     if record.check:
         _check_ended(state, record, outcome)
     else:
@@ -77,7 +77,7 @@ def drop_run(state: DispatchState, run_id: str) -> None:
 
 
 def restore_quarantine(state: DispatchState, worker: WorkerRecord) -> None:
-    """Apply what is known of the worker from earlier sessions."""
+    """Apply the worker's reputation from earlier sessions."""
     worker.quarantined = bool(state.auditor.of(worker.worker_id).quarantine)
     note_probation(state, worker.worker_id)
     state.pool.update_standing(worker)
