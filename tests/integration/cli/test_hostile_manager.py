@@ -10,6 +10,7 @@ from google.protobuf.message_factory import GetMessageClass
 from tests.fakes.commands import run
 
 from embomatrix.proto.v1 import admin_service_pb2, rollout_service_pb2
+from embomatrix.rpc.wire.bounds import is_repeated
 
 EVIL = "[/bold][red]\x1b]0;owned\x07\x1b[2J\u009b31m\u202e\nforged: all is well"
 CONTROL = frozenset("\x1b\x07\u009b\u202e")
@@ -40,7 +41,7 @@ def hostile(message):
     """Fill the fields of a message, with one element in each list and ``EVIL`` in each text."""
     for field in message.DESCRIPTOR.fields:
         value = VALUES.get(field.cpp_type, PROTOCOL)
-        is_list = field.label == field.LABEL_REPEATED
+        is_list = is_repeated(field)
         if field.message_type is not None and field.message_type.GetOptions().map_entry:
             continue
         if field.message_type is not None:

@@ -8,6 +8,8 @@ from typing import Any, Final, TypeVar
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
+from embomatrix.rpc.wire.bounds import is_repeated
+
 MessageT = TypeVar("MessageT", bound=Message)
 
 NUMBERS: Final = (0.0, -0.0, 1.0, -1.0, 5e-324, 1e9, -1e9, 1.7e308, -1.7e308, math.nan, math.inf, -math.inf)
@@ -93,7 +95,7 @@ class MessageMaker:
                 for _ in range(self._length()):
                     value = field.message_type.fields_by_name["value"]
                     entries[self.text()] = self._scalar(value)
-            elif field.label == FieldDescriptor.LABEL_REPEATED:
+            elif is_repeated(field):
                 self._extend(getattr(message, field.name), field, depth)
             elif field.message_type is not None:
                 part = getattr(message, field.name)
