@@ -44,6 +44,7 @@ class CachedActor:
     """Cached execution mode. Stateless: outcomes found offline are instantiated in the world."""
 
     drawing = frozenset({Skill.PLACE, Skill.SLICE})
+    keeps_state = False
 
     def reset(self, world: LiveWorld) -> None:
         """Do nothing: the world holds all state."""

@@ -6,7 +6,7 @@ explicit calls, and ``settle`` simulates a copy of the object's surroundings. Th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -33,6 +33,20 @@ class EngineError(Exception):
 
 class EngineMissingError(EngineError):
     """No physics engine is installed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Where one object is: its pose, its joints, and whether it is in the world."""
+
+    pose: Pose
+    fractions: tuple[float, ...]
+    present: bool
+    box: Aabb
+
+
+EngineMark = Mapping[str, Placed]
+"""Objects that differ from the scene as loaded, or once did since the last reset, in an engine's state."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +95,12 @@ class PhysicsEngine(Protocol):
 
         Objects that the scene marks absent are parked.
         """
+
+    def mark(self) -> EngineMark:
+        """Return the state for ``return_to``, in time proportional to the number of changed objects."""
+
+    def return_to(self, mark: EngineMark) -> None:
+        """Take on a state of this engine, bit-equal. The journal lists the objects that this changes."""
 
     def pose(self, name: str) -> Pose:
         """Pose of the object's asset frame in the world; the last one for a parked object."""

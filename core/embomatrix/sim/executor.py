@@ -1,14 +1,17 @@
 """Execution of plans in a scene: preconditions, actions, effects of heat and water, and the trace."""
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Callable, Iterator, Sequence, Set
-from typing import Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from embomatrix.sim.actions import CachedActor
 from embomatrix.sim.engine import PhysicsEngine
-from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.live_world import LiveWorld, WorldMark
 from embomatrix.sim.state.sources import Change
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
@@ -42,6 +45,10 @@ class Actor(Protocol):
     def drawing(self) -> Set[Skill]:
         """Skills that draw random numbers. The actor must not use ``rng`` for the others."""
 
+    @property
+    def keeps_state(self) -> bool:
+        """True if the actor has state of its own, besides the world's."""
+
     def reset(self, world: LiveWorld) -> None:
         """Start a rollout: ``world`` is at the scene's start."""
 
@@ -53,6 +60,20 @@ class Actor(Protocol):
 
     def close(self) -> None:
         """Free the actor's resources and end its use."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """State of an execution after some calls. It belongs to the simulator that made it."""
+
+    task: Task
+    seed: int
+    prefix: Plan
+    succeeded: int
+    touched: frozenset[str]
+    hash: hashlib._Hash
+    world: WorldMark | None
+    """None in a mode that returns by executing the prefix again."""
 
 
 class StepRandom:
@@ -99,8 +120,10 @@ class Simulator:
         self._tables = [task.table for task in bundle.tasks.values()]
         self._actor: Actor = actor if actor is not None else CachedActor()
         self._draws = StepRandom()
+        self._task: Task | None = None
         self._seed = 0
-        self._count = 0
+        self._succeeded = 0
+        self._calls: list[SkillCall] = []
         self._hash = hashlib.sha256()
         self._touched: set[str] = set()
 
@@ -113,8 +136,10 @@ class Simulator:
         """Return to the scene's start. ``seed`` (not negative) decides between equally good outcomes."""
         self.world.reset(task)
         self._actor.reset(self.world)
+        self._task = task
         self._seed = seed
-        self._count = 0
+        self._succeeded = 0
+        self._calls.clear()
         self._touched = set()
         self._hash = hashlib.sha256(self.world.scene.scene_id.encode())
         self._hash.update(self.world.state_bytes())
@@ -125,21 +150,55 @@ class Simulator:
         A call that its preconditions refuse changes nothing, nor does a failed call in cached mode.
         """
         world = self.world
-        self._count += 1
+        self._calls.append(call)
         held = world.carried[:1]
         refusal = check(world, call)
         if refusal is None:
             if call.skill in self._actor.drawing:
-                # Equal plan prefixes see equal numbers: the stream depends on the step, not on earlier draws.
-                self._draws.go_to(self._seed, self._count)
+                # Equal plan prefixes see equal numbers: the stream depends on the seed and on how many calls succeeded.
+                self._draws.go_to(self._seed, self._succeeded + 1)
             refusal = self._actor.act(world, call, self._draws.generator)
         if refusal is not None:
             self._hash.update(world.state_bytes() + refusal.reason.encode())
             return Step(call, refusal.reason, refusal.sentence, refusal.blocker)
+        self._succeeded += 1
         changes = world.let_sources_act() if call.skill in CHANGING else ()
         self._touched.update(filter(None, (target_of(world, call), source_of(world, call))))
         self._hash.update(world.state_bytes())
         return Step(call, None, self._message(call, held, changes))
+
+    def mark(self) -> Mark:
+        """Return the present state for ``return_to``. Raises RuntimeError before the first reset."""
+        if self._task is None:
+            raise RuntimeError("nothing was executed: reset the simulator before it is marked")
+        world = None if self._actor.keeps_state else self.world.mark()
+        return Mark(
+            self._task,
+            self._seed,
+            tuple(self._calls),
+            self._succeeded,
+            self.touched,
+            self._hash.copy(),
+            world,
+        )
+
+    def return_to(self, mark: Mark) -> None:
+        """Take on a state that this simulator marked: all that follows is bit-equal to what followed then.
+
+        The time depends on the number of objects that have changed. A mode whose actor keeps state of its own executes the
+        calls again.
+        """
+        if mark.world is None:
+            self.reset(mark.task, mark.seed)
+            for call in mark.prefix:
+                self.run_step(call)
+            return
+        self.world.return_to(mark.world)
+        self._task, self._seed = mark.task, mark.seed
+        self._calls = list(mark.prefix)
+        self._succeeded = mark.succeeded
+        self._touched = set(mark.touched)
+        self._hash = mark.hash.copy()
 
     def execute(
         self, task: Task, plan: Plan, seed: int, on_step: Callable[[int], None] = lambda _: None

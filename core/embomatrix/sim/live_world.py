@@ -2,22 +2,23 @@
 
 import itertools
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from embomatrix.sim.engine import PhysicsEngine
+from embomatrix.sim.engine import EngineMark, PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.floor.prepared import PreparedScene, prepared_arrays
 from embomatrix.sim.joints.swings import Swings
 from embomatrix.sim.placing.placement import Placer
 from embomatrix.sim.state.facts import EngineFacts, TrackedSets
 from embomatrix.sim.state.relations import Relations
-from embomatrix.sim.state.sources import Change, ChangeReader, Thermal, Water
+from embomatrix.sim.state.sources import Change, ChangeReader, Thermal, Unread, Water
 from embomatrix.sim.state.supports import Host
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.view import ObjectReach
 from embomatrix.world.asset import Asset
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import StandPose
 from embomatrix.world.state import Relation, State, SubstanceFact
 from embomatrix.world.substances import MEANINGS, facts_of
 from embomatrix.world.task import Task
@@ -25,6 +26,31 @@ from embomatrix.world.task import Task
 LASTING = frozenset(Relation) - {Relation.INROOM}
 """Relations between objects that are carried together."""
 SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
+
+
+@dataclass(frozen=True, slots=True)
+class HandMark:
+    """State of the hand."""
+
+    hosts: Mapping[str, Host]
+    pairs: frozenset[tuple[Relation, str, str]]
+    offsets: Mapping[str, Pose]
+
+
+@dataclass(frozen=True, slots=True)
+class WorldMark:
+    """State of a rollout's world, as far as it differs from the scene's start."""
+
+    engine: EngineMark
+    states: Mapping[str, frozenset[State]]
+    substances: Mapping[str, frozenset[SubstanceFact]]
+    treatments: Mapping[str, frozenset[tuple[State, str]]]
+    absent: frozenset[str]
+    hand: HandMark
+    robot: StandPose
+    unread: Unread
+    acting: frozenset[str]
+    table: tuple[str, ...]
 
 
 class Hand:
@@ -45,6 +71,16 @@ class Hand:
     def forget(self) -> None:
         """Empty the hand without placing anything, after a reset of the world."""
         self._hold({})
+
+    def mark(self) -> HandMark:
+        """Return the state for ``return_to``."""
+        return HandMark(self.hosts, frozenset(self.pairs), self.offsets)
+
+    def return_to(self, mark: HandMark) -> None:
+        """Take on a state without moving anything."""
+        self._hold(mark.offsets)
+        self.hosts = mark.hosts
+        self.pairs.update(mark.pairs)
 
     def take(self, group: Sequence[str]) -> None:
         """Take the first object of the group, with the others as its contents."""
@@ -136,6 +172,36 @@ class LiveWorld:
         self.robot = self.navigator.start
         self.navigator.refresh()
         self.table = task.table
+
+    def mark(self) -> WorldMark:
+        """Return the present state for ``return_to``."""
+        return WorldMark(
+            self.engine.mark(),
+            self.states.mark(),
+            self.substances.mark(),
+            self.treatments.mark(),
+            frozenset(self.absent),
+            self.hand.mark(),
+            self.robot,
+            self._changes_since.unread(),
+            self.water.acting,
+            self.table,
+        )
+
+    def return_to(self, mark: WorldMark) -> None:
+        """Take on a state of this world since the last reset. All that follows is bit-equal to what followed then."""
+        self.engine.return_to(mark.engine)
+        self.states.return_to(mark.states)
+        self.substances.return_to(mark.substances)
+        self.treatments.return_to(mark.treatments)
+        self.absent.clear()
+        self.absent |= mark.absent
+        self.hand.return_to(mark.hand)
+        self.robot = mark.robot
+        self._changes_since.keep(mark.unread)
+        self.water.return_to(mark.acting)
+        self.table = mark.table
+        self.navigator.refresh()
 
     def let_sources_act(self) -> tuple[Change, ...]:
         """Let heat, cold and water act on the objects at their sources. Return the changes."""

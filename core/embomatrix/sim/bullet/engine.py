@@ -22,7 +22,9 @@ from embomatrix.sim.engine import (
     TOLERANCE_M,
     WALL,
     EngineError,
+    EngineMark,
     Journal,
+    Placed,
     Settled,
 )
 from embomatrix.sim.geometry.bounds import AssetBounds, bounds_of, forget
@@ -103,6 +105,32 @@ class BulletEngine:
         self._chunks.clear()
         self._all_chunks = b""
         self._journal.begin_round()
+
+    def mark(self) -> EngineMark:
+        return {self._names[number]: self._placed(number) for number in self._changed}
+
+    def return_to(self, mark: EngineMark) -> None:
+        numbers = self._changed | {self._index[name] for name in mark}
+        for number in sorted(numbers):
+            target = mark.get(self._names[number]) or self._placed_at_start(number)
+            if target == self._placed(number):
+                continue
+            self._note(number)
+            self._poses[number], self._fractions[number] = target.pose, target.fractions
+            self._present[number] = target.present
+            self._bodies.leave_behind(number)
+            self._bound(number, target.box)
+
+    def _placed(self, number: int) -> Placed:
+        return Placed(
+            self._poses[number], self._fractions[number], self._present[number], self._boxes[number]
+        )
+
+    def _placed_at_start(self, number: int) -> Placed:
+        item = self._scene.objects[number]
+        return Placed(
+            item.pose_world_asset, tuple(item.joints), not item.absent, self._boxes_at_start[number]
+        )
 
     def pose(self, name: str) -> Pose:
         try:

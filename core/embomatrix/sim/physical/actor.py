@@ -40,6 +40,7 @@ class PhysicalActor:
     """Actor that carries out calls with the robot in a dedicated dynamic world."""
 
     drawing = frozenset(Skill)
+    keeps_state = True
 
     def __init__(self, bundle: Bundle) -> None:
         """Create a dynamic world. It is built at the first reset and closed with the actor."""

@@ -58,6 +58,16 @@ class TrackedSets(dict[str, set[T]]):
         touched = [(name, super(TrackedSets, self).__getitem__(name)) for name in sorted(self._touched)]
         return [(name, members) for name, members in touched if members != self._kept[name]]
 
+    def mark(self) -> Mapping[str, frozenset[T]]:
+        """Return the sets that differ from the snapshot, for ``return_to``."""
+        return {name: frozenset(members) for name, members in self.changed()}
+
+    def return_to(self, mark: Mapping[str, frozenset[T]]) -> None:
+        """Take on the sets of a mark."""
+        self.restore()
+        for name, members in mark.items():
+            self[name] = set(members)
+
     def restore(self) -> None:
         """Restore the snapshot."""
         for name, _ in self.changed():

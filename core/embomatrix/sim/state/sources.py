@@ -32,6 +32,14 @@ VESSEL_M: Final = 0.3
 """Largest height over a source of the underside of an object that stands in a vessel on the source."""
 
 
+@dataclass(frozen=True, slots=True)
+class Unread:
+    """Changes that a ``ChangeReader`` has not read, and whether the engine was reset before them."""
+
+    entries: tuple[tuple[str, Aabb | None], ...]
+    was_reset: bool
+
+
 class ChangeReader:
     """Reader of an engine's journal. A reset alone is not a change."""
 
@@ -41,23 +49,35 @@ class ChangeReader:
         self._engine = engine
         self._round = engine.journal.rounds
         self._read = 0
+        self._kept = Unread((), was_reset=False)
+        """Unread changes of the state that the engine returned to."""
         self._names: set[str] = set()
         self._places: list[Aabb] = []
 
+    def unread(self) -> Unread:
+        """Return the changes since the last ``read``, for ``keep``."""
+        journal = self._engine.journal
+        if journal.rounds != self._round:
+            return Unread(tuple(journal.entries), was_reset=True)
+        return Unread((*self._kept.entries, *journal.entries[self._read :]), was_reset=self._kept.was_reset)
+
+    def keep(self, unread: Unread) -> None:
+        """Take these changes for the unread ones, instead of those in the journal."""
+        journal = self._engine.journal
+        self._round, self._read, self._kept = journal.rounds, len(journal.entries), unread
+
     def read(self) -> None:
         """Read the changes since the last call."""
-        journal = self._engine.journal
-        self.was_reset = journal.rounds != self._round
-        if self.was_reset:
-            self._round, self._read = journal.rounds, 0
+        unread = self.unread()
+        self.was_reset = unread.was_reset
         names = self._names = set[str]()
         self._places.clear()
-        for name, box in journal.entries[self._read :]:
+        for name, box in unread.entries:
             if name not in names:
                 names.add(name)
                 if box is not None:
                     self._places.append(box)
-        self._read = len(journal.entries)
+        self.keep(Unread((), was_reset=False))
         self._places += [self._engine.aabb(name) for name in names if not self._engine.is_parked(name)]
 
     def affects(self, name: str, area: Aabb) -> bool:
@@ -197,6 +217,15 @@ class Water:
             machine = washing(asset)
             if machine is not None or flows_from(asset.synset):
                 self._sources.append((item.name, machine))
+
+    @property
+    def acting(self) -> frozenset[str]:
+        """Sources that have acted since they were started."""
+        return frozenset(self._acting)
+
+    def return_to(self, acting: frozenset[str]) -> None:
+        """Take on the state in which these sources were acting."""
+        self._acting = set(acting)
 
     def apply(self, changed: ChangeReader) -> list[Change]:
         """Let every running source act on its contents. Return the changes since the last call, also those by hand."""
