@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -68,12 +68,13 @@ class Mark:
 
     task: Task
     seed: int
-    prefix: Plan
+    calls: Plan
+    """Calls so far, in a mode that returns by executing them again."""
     succeeded: int
     touched: frozenset[str]
     hash: hashlib._Hash
     world: WorldMark | None
-    """None in a mode that returns by executing the prefix again."""
+    """None in such a mode."""
 
 
 class StepRandom:
@@ -150,7 +151,8 @@ class Simulator:
         A call that its preconditions refuse changes nothing, nor does a failed call in cached mode.
         """
         world = self.world
-        self._calls.append(call)
+        if self._actor.keeps_state:
+            self._calls.append(call)
         held = world.carried[:1]
         refusal = check(world, call)
         if refusal is None:
@@ -175,7 +177,7 @@ class Simulator:
         return Mark(
             self._task,
             self._seed,
-            tuple(self._calls),
+            tuple(self._calls) if world is None else (),
             self._succeeded,
             self.touched,
             self._hash.copy(),
@@ -190,12 +192,11 @@ class Simulator:
         """
         if mark.world is None:
             self.reset(mark.task, mark.seed)
-            for call in mark.prefix:
+            for call in mark.calls:
                 self.run_step(call)
             return
         self.world.return_to(mark.world)
         self._task, self._seed = mark.task, mark.seed
-        self._calls = list(mark.prefix)
         self._succeeded = mark.succeeded
         self._touched = set(mark.touched)
         self._hash = mark.hash.copy()
@@ -211,6 +212,10 @@ class Simulator:
             on_step(len(steps))
             if not steps[-1].ok:
                 break
+        return self.trace(task, plan, steps)
+
+    def trace(self, task: Task, plan: Plan, steps: Sequence[Step]) -> Trace:
+        """Return the trace of a plan whose steps led to the present state."""
         return Trace(
             plan=plan,
             steps=tuple(steps),

@@ -1,7 +1,5 @@
 """A return to a mark is bit-equal to executing its calls again, whatever happened in between."""
 
-import random
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,0 +1,147 @@
+"""Tree of transitions: the calls that plans have in common are executed once.
+
+A call after the same calls of the same task with the same seed has the same outcome to the bit. So a plan walks down the tree
+as far as it is known, and only the rest is executed.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
+
+from embomatrix.skills.trace import Step, Trace
+
+if TYPE_CHECKING:
+    from embomatrix.sim.executor import Mark, Simulator
+    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.world.task import Task
+
+NODES_KEPT: Final = 4_000
+"""Nodes in memory, about 3 kB each."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Ending(Generic[T]):
+    """What a plan that ends at a node is answered: all of its trace but the steps, and the caller's judgement."""
+
+    touched: frozenset[str]
+    final: tuple[str, ...]
+    digest: str
+    judgement: T
+
+
+@dataclass(slots=True, eq=False)
+class _Node(Generic[T]):
+    """State after a call. A root stands for the start, without a call."""
+
+    parent: _Node[T] | None
+    key: object
+    """Key in the parent's children: the call. For a root, task id and seed."""
+    step: Step | None = None
+    mark: Mark | None = None
+    ending: Ending[T] | None = None
+    children: dict[SkillCall, _Node[T]] = field(default_factory=dict)
+
+
+class TransitionTree(Generic[T]):
+    """Executes plans with one simulator, which nothing else may use in the meantime.
+
+    ``judge`` judges a task in the simulator's present state. It must depend on these two alone.
+    """
+
+    def __init__(self, simulator: Simulator, judge: Callable[[Task], T], most: int = NODES_KEPT) -> None:
+        self._simulator = simulator
+        self._judge = judge
+        self._most = most
+        self._roots: dict[tuple[str, int], _Node[T]] = {}
+        self._nodes: OrderedDict[_Node[T], None] = OrderedDict()
+        """All nodes. Those not used for longest are first, and a node always before its parent."""
+        self._here: _Node[T] | None = None
+        """Node with the simulator's state; None if unknown."""
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def execute(
+        self, task: Task, plan: Plan, seed: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> tuple[Trace, T, int]:
+        """Return the trace of the plan, its judgement, and the number of its steps that were known.
+
+        Equal to ``Simulator.execute`` and a judgement of the final state. ``on_step`` receives the number of finished steps.
+        """
+        node = self._root(task, seed)
+        steps: list[Step] = []
+        for call in plan:
+            known = node.children.get(call)
+            if known is None:
+                break
+            node = known
+            steps.append(_step_of(node))
+        shared = len(steps)
+        if shared:
+            on_step(shared)
+        if shared < len(plan) and (not steps or steps[-1].ok):
+            self._go_to(node, task, seed)
+            for call in plan[shared:]:
+                node = self._run(node, call)
+                steps.append(_step_of(node))
+                on_step(len(steps))
+                if not steps[-1].ok:
+                    break
+        ending = node.ending
+        if ending is None:
+            self._go_to(node, task, seed)
+            end = self._simulator.trace(task, (), ())
+            ending = node.ending = Ending(end.touched, end.final, end.digest, self._judge(task))
+        self._use(node)
+        trace = Trace(plan, tuple(steps), ending.touched, ending.final, ending.digest)
+        return trace, ending.judgement, shared
+
+    def _root(self, task: Task, seed: int) -> _Node[T]:
+        key = (task.task_id, seed)
+        root = self._roots.get(key)
+        if root is None:
+            root = self._roots[key] = _Node(None, key)
+        return root
+
+    def _run(self, node: _Node[T], call: SkillCall) -> _Node[T]:
+        """Execute a call at the simulator's present node."""
+        step = self._simulator.run_step(call)
+        child = node.children[call] = _Node(node, call, step, self._simulator.mark())
+        self._here = child
+        return child
+
+    def _go_to(self, node: _Node[T], task: Task, seed: int) -> None:
+        """Bring the simulator to the state of a node."""
+        if self._here is node:
+            return
+        if node.mark is not None:
+            self._simulator.return_to(node.mark)
+        else:
+            self._simulator.reset(task, seed)
+        self._here = node
+
+    def _use(self, node: _Node[T]) -> None:
+        """Note that a node and its ancestors were used, and forget nodes beyond the limit."""
+        last: _Node[T] | None = node
+        while last is not None:
+            self._nodes[last] = None
+            self._nodes.move_to_end(last)
+            last = last.parent
+        while len(self._nodes) > self._most:
+            oldest, _ = self._nodes.popitem(last=False)
+            if oldest is self._here:
+                self._here = None
+            if oldest.parent is None:
+                del self._roots[oldest.key]  # type: ignore[arg-type]
+            else:
+                del oldest.parent.children[oldest.key]  # type: ignore[arg-type]
+
+
+def _step_of(node: _Node[T]) -> Step:
+    assert node.step is not None
+    return node.step
