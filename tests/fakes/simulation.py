@@ -24,7 +24,7 @@ class FakeSimulation:
         if os.environ.get("FAKE_SIMULATION") == "broken":
             raise RuntimeError("the engine is missing: install it")
 
-    def load(self, path, digest):
+    def load(self, path, digest, *, sharing):
         match _word_in(path):
             case "corrupt":
                 raise BundleCorruptError("not what its digest says")

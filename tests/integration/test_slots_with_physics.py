@@ -59,7 +59,7 @@ def kitchen():
 class Harness:
     """Pool over a folder of bundles."""
 
-    def __init__(self, folder, bundle, slots):
+    def __init__(self, folder, bundle, slots, sharing=True):
         self.folder = folder
         data = encode_bundle(bundle)
         self.digest = bundle_digest(data)
@@ -68,7 +68,7 @@ class Harness:
         (folder / "kitchen.bundle").write_bytes(data)
         self.paths = {self.digest: folder / "kitchen.bundle"}
         self.pool = SlotPool(
-            SlotLimits(slots, 1000.0, slot_memory_mb=512, fork_s=1.0),
+            SlotLimits(slots, 1000.0, slot_memory_mb=512, fork_s=1.0, sharing=sharing),
             bundle_path=self._path,
             on_result=self._take,
             on_change=lambda: None,
@@ -108,8 +108,8 @@ class Harness:
 
 
 @contextlib.asynccontextmanager
-async def running(folder, bundle, slots=1):
-    harness = Harness(folder, bundle, slots)
+async def running(folder, bundle, slots=1, sharing=True):
+    harness = Harness(folder, bundle, slots, sharing)
     await harness.pool.start()
     task = asyncio.create_task(harness.pool.run())
     try:
@@ -134,8 +134,9 @@ for text in sys.argv[2:]:
 """
 
 
-async def test_equal_plans_have_equal_digests_in_every_slot(tmp_path, kitchen):
-    async with running(tmp_path, kitchen, slots=2) as harness:
+@pytest.mark.parametrize("sharing", [True, False])
+async def test_equal_plans_have_equal_digests_in_every_slot(tmp_path, kitchen, sharing):
+    async with running(tmp_path, kitchen, slots=2, sharing=sharing) as harness:
         rounds = [list(enumerate(PLANS)), list(enumerate(PLANS))[::-1], list(enumerate(PLANS)) * 2]
         for number, plans in enumerate(rounds):
             for order, (index, text) in enumerate(plans):

@@ -1,10 +1,26 @@
 """Hierarchical reward: format, relevance and goal, with the paper's constants as defaults."""
 
+from dataclasses import dataclass
+
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.goal import Facts
 from embomatrix.world.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What a final state fulfils of a task, whatever it is worth."""
+
+    atoms: tuple[AtomResult, ...]
+    success: bool
+
+
+def judge(task: Task, facts: Facts) -> Judgement:
+    """Judge a final state. Raises GoalError if the goal quantifies over a type that the task does not list."""
+    atoms = tuple(AtomResult(text, evaluate(atom, facts, task.types)) for atom, text in task.goal_atoms)
+    return Judgement(atoms, evaluate(task.goal, facts, task.types))
 
 
 def score(
@@ -15,15 +31,22 @@ def score(
     ``touched`` names the objects on which a call succeeded; ``facts`` is the final state. Raises GoalError if the goal
     quantifies over a type that the task does not list.
     """
+    return worth(task, touched, judge(task, facts), settings)
+
+
+def worth(
+    task: Task, touched: frozenset[str], judgement: Judgement, settings: RewardSettings = PAPER
+) -> RewardBreakdown:
+    """Return the reward of an executed plan whose final state was judged."""
     relevant = len(task.goal_objects & touched)
-    atoms = tuple(AtomResult(text, evaluate(atom, facts, task.types)) for atom, text in task.goal_atoms)
+    atoms = judgement.atoms
     satisfied = sum(atom.holds for atom in atoms)
     return RewardBreakdown(
         format=settings.format,
         relevance=min(settings.relevance_limit, settings.relevance_per_object * relevant),
         goal=settings.goal * satisfied / len(atoms) if atoms else 0.0,
         atoms=atoms,
-        success=evaluate(task.goal, facts, task.types),
+        success=judgement.success,
     )
 
 

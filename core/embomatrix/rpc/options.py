@@ -73,7 +73,7 @@ def add_settings(
                 continue
             default = None if field.is_required() or field.default_factory else field.default
             word = name.replace("_", "-")
-            is_switch = field.annotation == bool | None
+            is_switch = field.annotation == bool | None or default is True
             option = typer.Option(
                 f"--{word}/--no-{word}" if is_switch else f"--{word}",
                 help=(field.description or "").replace("``", "`"),

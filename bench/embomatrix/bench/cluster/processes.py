@@ -109,7 +109,8 @@ def _worker_command(
         return (slow, "worker", str(load_delay_s), address, name, str(slots), str(cache))
     worker = ("embomatrix.cli", "worker", "run", f"--manager={address}", f"--name={name}", f"--slots={slots}")
     # Manager, workers and trainer share the cores at equal priority.
-    return (*worker, f"--cache-dir={cache}", "--nice=0")
+    # Plans that repeat would measure a look-up, not an execution.
+    return (*worker, f"--cache-dir={cache}", "--nice=0", "--no-sharing")
 
 
 def running_manager(folder: Path, *options: str) -> contextlib.AbstractContextManager[Process]:

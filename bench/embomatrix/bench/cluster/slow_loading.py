@@ -22,9 +22,9 @@ class SlowPhysics(Physics):
     def __init__(self, delay_s: float) -> None:
         self._delay_s = delay_s
 
-    def load(self, path: Path, digest: str) -> PhysicsScene:
+    def load(self, path: Path, digest: str, *, sharing: bool) -> PhysicsScene:
         time.sleep(self._delay_s)
-        return super().load(path, digest)
+        return super().load(path, digest, sharing=sharing)
 
 
 def serve(delay_s: str, manager: str, name: str, slots: str, folder: str) -> None:
@@ -35,7 +35,13 @@ def serve(delay_s: str, manager: str, name: str, slots: str, folder: str) -> Non
     from embomatrix.worker.link import daemon
 
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)-7s %(message)s")
-    values: dict[str, Any] = {"manager": manager, "name": name, "slots": slots, "cache_dir": Path(folder)}
+    values: dict[str, Any] = {
+        "manager": manager,
+        "name": name,
+        "slots": slots,
+        "cache_dir": Path(folder),
+        "sharing": False,
+    }
     chosen = settings.WorkerSettings(**values)
     program = (sys.executable, "-m", "embomatrix.bench.cluster.slow_loading", "simulator", delay_s)
     worker = daemon.Daemon(chosen, resources.measure(chosen), np.random.default_rng(), program=program)

@@ -74,6 +74,7 @@ async def _load(root: Root, scene: SceneWork, path: Path, sample: SlotSample) ->
         "digest": scene.bundle_digest,
         "slot_memory_mb": memory_mb,
         "scene_memory_mb": memory_mb,
+        "sharing": False,
     }
     answer = await _ask(child, PipeMessage(request))
     sample.load_s.append(float(answer.header["cpu_s"]))

@@ -64,7 +64,8 @@ class SceneProcess:
         self._folder = folder
         physics = Physics()
         physics.prepare()
-        self._scenes = {digest: physics.load(Path(folder) / _file(digest), digest) for digest in digests}
+        paths = {digest: Path(folder) / _file(digest) for digest in digests}
+        self._scenes = {digest: physics.load(path, digest, sharing=False) for digest, path in paths.items()}
         self._executed = 0
         for scene in self._scenes.values():
             for _ in scene.complete():

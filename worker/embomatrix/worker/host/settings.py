@@ -38,6 +38,8 @@ class WorkerSettings(BaseModel):
     """Share of the memory that is free, and within the control group's limit, at the start."""
     slot_memory_mb: int = Field(2048, ge=64)
     """Memory that one rollout may allocate beyond what its scene holds."""
+    sharing: bool = True
+    """Execute the calls that plans have in common once. Results are equal without it, and take longer."""
     cache_dir: Path = Path("~/.cache/embomatrix/worker")
     """Folder of fetched bundles and of the simulator's log."""
     cache_mb: int = Field(1024, ge=1)

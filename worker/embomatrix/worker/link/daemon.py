@@ -125,7 +125,9 @@ class Daemon:
     def _new_pool(self, program: tuple[str, ...]) -> SlotPool:
         resources, settings = self._resources, self._settings
         return SlotPool(
-            SlotLimits(resources.slots, resources.memory_mb, settings.slot_memory_mb),
+            SlotLimits(
+                resources.slots, resources.memory_mb, settings.slot_memory_mb, sharing=settings.sharing
+            ),
             bundle_path=self._cache.path_of,
             on_result=self._take_result,
             on_change=self._residents_changed,

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from embomatrix.reward.hierarchy import score
+from embomatrix.reward.hierarchy import judge, worth
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.wire.outcome import completed_to_proto
 from embomatrix.rpc.wire.rollout import rollout_from_proto, rollout_to_proto
@@ -18,6 +18,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
+from embomatrix.sim.transitions import TransitionTree
 from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
 from embomatrix.worker.slots.warm_up import PLAN, TIMES, WARM_UP, warm_up_bundle
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
@@ -39,18 +40,18 @@ class Physics:
         self._clients = ClientPool(spare=CLIENTS_PER_SCENE)
         self._warm_up()
 
-    def load(self, path: Path, digest: str) -> PhysicsScene:
+    def load(self, path: Path, digest: str, *, sharing: bool) -> PhysicsScene:
         try:
             bundle = read_bundle(path, digest=digest)
         except BundleError as error:
             raise BundleCorruptError(str(error)) from error
-        return PhysicsScene(bundle, self._clients)
+        return PhysicsScene(bundle, self._clients, sharing=sharing)
 
     def _warm_up(self) -> None:
         """Load and execute a small scene and forget it: see ``warm_up``."""
         data = encode_bundle(warm_up_bundle())
         for _ in range(TIMES):
-            scene = PhysicsScene(decode_bundle(data), self._clients)
+            scene = PhysicsScene(decode_bundle(data), self._clients, sharing=True)
             rollout = Rollout(WARM_UP, WARM_UP, bundle_digest(data), WARM_UP, PLAN, 0)
             completed = scene.execute(rollout_from_proto(rollout_to_proto(rollout)))
             completed_to_proto(completed).SerializeToString()
@@ -58,16 +59,19 @@ class Physics:
 
 
 class PhysicsScene:
-    """Scene of a bundle in the engine. Every execution starts from the scene as it was loaded."""
+    """Scene of a bundle in the engine. Every execution has the result of one that starts from the scene as it was loaded."""
 
-    def __init__(self, bundle: Bundle, clients: ClientPool) -> None:
+    def __init__(self, bundle: Bundle, clients: ClientPool, *, sharing: bool) -> None:
+        """With ``sharing``, calls that plans have in common are executed once."""
         self._tasks = bundle.tasks
         self._engine = BulletEngine(bundle.scene, clients, PreparedScene.of(bundle))
         self._simulator = Simulator(bundle, self._engine)
         for task in list(bundle.tasks.values())[:1]:
             # An empty plan completes lazy initialisation before slots are forked.
             self._simulator.execute(task, (), 0)
-            score(task, frozenset(), self._simulator.facts)
+            judge(task, self._simulator.facts)
+        facts = self._simulator.facts
+        self._tree = TransitionTree(self._simulator, lambda task: judge(task, facts)) if sharing else None
 
     def complete(self) -> Iterator[None]:
         """Complete deferred work of later executions."""
@@ -93,9 +97,13 @@ class PhysicsScene:
                 f"bundle {rollout.bundle_digest} has no task {rollout.task_id!r}: "
                 f"it has {len(self._tasks)}; submit the digest of the task's own bundle"
             )
-        trace = self._simulator.execute(task, rollout.plan, rollout.seed, on_step)
+        if self._tree is not None:
+            trace, judgement, _ = self._tree.execute(task, rollout.plan, rollout.seed, on_step)
+        else:
+            trace = self._simulator.execute(task, rollout.plan, rollout.seed, on_step)
+            judgement = judge(task, self._simulator.facts)
         return Completed(
-            reward=score(task, trace.touched, self._simulator.facts, reward),
+            reward=worth(task, trace.touched, judgement, reward),
             steps=trace.steps,
             final=trace.final,
             trace_digest=trace.digest,

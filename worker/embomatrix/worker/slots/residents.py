@@ -61,6 +61,8 @@ class SlotLimits:
     memory_mb: float
     slot_memory_mb: int = 2048
     fork_s: float = FORK_S
+    sharing: bool = True
+    """Whether a slot executes the calls that plans have in common once."""
 
     @property
     def idle_slots(self) -> int:
@@ -287,6 +289,7 @@ class Residents:
         request = {
             "path": str(path),
             "digest": scene.digest,
+            "sharing": self._limits.sharing,
             "slot_memory_mb": self._limits.slot_memory_mb,
             "scene_memory_mb": max(int(self._limits.memory_mb), SMALLEST_LIMIT_MB),
         }

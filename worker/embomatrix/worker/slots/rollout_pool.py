@@ -70,7 +70,7 @@ def execute_scene(folder: Path, rollouts: Sequence[Rollout]) -> Results:
     """
     try:
         bundle = Dataset(folder, ()).read_bundle(rollouts[0].bundle_digest)
-        scene = PhysicsScene(bundle, _clients())
+        scene = PhysicsScene(bundle, _clients(), sharing=True)
     except EngineMissingError:
         raise
     except (DatasetError, EngineError) as error:

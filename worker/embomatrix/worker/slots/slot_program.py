@@ -52,7 +52,7 @@ _COUNTER: Final = struct.Struct("=Q")
 
 
 class LoadedScene(Protocol):
-    """Scene in memory that executes plans. No state carries over from one rollout to the next."""
+    """Scene in memory that executes plans. No result depends on the rollouts before."""
 
     def execute(self, rollout: Rollout, on_step: Callable[[int], None], reward: RewardSettings) -> Completed:
         """Execute the plan and score it; ``on_step`` gets the number of finished steps after each step."""
@@ -67,8 +67,11 @@ class SimulationBackend(Protocol):
     def prepare(self) -> None:
         """Import and connect everything that scenes share, before the first fork."""
 
-    def load(self, path: Path, digest: str) -> LoadedScene:
-        """Load the bundle in this file. Raise BundleCorruptError if the content does not match the digest."""
+    def load(self, path: Path, digest: str, *, sharing: bool) -> LoadedScene:
+        """Load the bundle in this file. With ``sharing``, a slot executes the calls that plans have in common once.
+
+        Raise BundleCorruptError if the content does not match the digest.
+        """
 
 
 class BundleCorruptError(Exception):
@@ -131,7 +134,8 @@ def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board:
     most_mb = int(request.header["scene_memory_mb"])
     try:
         with memory_limited(most_mb):
-            scene = simulation.load(Path(request.header["path"]), request.header["digest"])
+            path, sharing = Path(request.header["path"]), bool(request.header["sharing"])
+            scene = simulation.load(path, request.header["digest"], sharing=sharing)
     except MemoryError:
         text = (
             f"the scene takes more than {most_mb} MB: give the worker more memory, or make the scene smaller"
