@@ -10,17 +10,17 @@ from embomatrix.world.task import Task
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class Fulfilment:
     """What a final state fulfils of a task, whatever it is worth."""
 
     atoms: tuple[AtomResult, ...]
     success: bool
 
 
-def judge(task: Task, facts: Facts) -> Judgement:
+def judge(task: Task, facts: Facts) -> Fulfilment:
     """Judge a final state. Raises GoalError if the goal quantifies over a type that the task does not list."""
     atoms = tuple(AtomResult(text, evaluate(atom, facts, task.types)) for atom, text in task.goal_atoms)
-    return Judgement(atoms, evaluate(task.goal, facts, task.types))
+    return Fulfilment(atoms, evaluate(task.goal, facts, task.types))
 
 
 def score(
@@ -35,7 +35,7 @@ def score(
 
 
 def worth(
-    task: Task, touched: frozenset[str], judgement: Judgement, settings: RewardSettings = PAPER
+    task: Task, touched: frozenset[str], judgement: Fulfilment, settings: RewardSettings = PAPER
 ) -> RewardBreakdown:
     """Return the reward of an executed plan whose final state was judged."""
     relevant = len(task.goal_objects & touched)
