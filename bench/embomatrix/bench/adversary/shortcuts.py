@@ -25,7 +25,7 @@ class HuntSizes:
     """
 
     tasks: int = 48
-    plans: int = 15_000
+    plans: int = 12_000
     seed: int = 0
 
 
