@@ -11,7 +11,7 @@ from embomatrix.world.task import Task
 
 @dataclass(frozen=True, slots=True)
 class Fulfilment:
-    """What a final state fulfils of a task, whatever it is worth."""
+    """Parts of a goal that a final state fulfils, whatever they are worth."""
 
     atoms: tuple[AtomResult, ...]
     success: bool

@@ -37,7 +37,7 @@ class EngineMissingError(EngineError):
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Where one object is: its pose, its joints, and whether it is in the world."""
+    """Place of one object: its pose, its joints, its box, and whether it is in the world."""
 
     pose: Pose
     fractions: tuple[float, ...]

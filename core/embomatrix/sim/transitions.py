@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Ending(Generic[T]):
-    """What a plan that ends at a node is answered: all of its trace but the steps, and the caller's judgement."""
+    """Answer to plans that end at a node: all of the trace but the steps, and the caller's judgement."""
 
     touched: frozenset[str]
     final: tuple[str, ...]

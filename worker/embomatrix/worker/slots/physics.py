@@ -62,7 +62,7 @@ class PhysicsScene:
     """Scene of a bundle in the engine. Every execution has the result of one that starts from the scene as it was loaded."""
 
     def __init__(self, bundle: Bundle, clients: ClientPool, *, sharing: bool) -> None:
-        """With ``sharing``, calls that plans have in common are executed once."""
+        """Load the scene. With ``sharing``, calls that plans have in common are executed once."""
         self._tasks = bundle.tasks
         self._engine = BulletEngine(bundle.scene, clients, PreparedScene.of(bundle))
         self._simulator = Simulator(bundle, self._engine)

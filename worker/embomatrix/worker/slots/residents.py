@@ -62,7 +62,7 @@ class SlotLimits:
     slot_memory_mb: int = 2048
     fork_s: float = FORK_S
     sharing: bool = True
-    """Whether a slot executes the calls that plans have in common once."""
+    """True if a slot executes the calls that plans have in common once."""
 
     @property
     def idle_slots(self) -> int:
