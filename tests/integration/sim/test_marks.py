@@ -1,5 +1,7 @@
 """A return to a mark is bit-equal to executing its calls again, whatever happened in between."""
 
+import contextlib
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,6 +11,7 @@ from tests.fakes.scenes import kitchen_scene
 from tests.integration.sim.test_household import CALLS
 from tests.integration.sim.test_reset import CALL_SEQUENCES
 
+from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
 
@@ -115,3 +118,21 @@ def test_ten_thousand_walks_in_the_kitchen_equal_plain_execution(scenes, seed, m
 def test_ten_thousand_walks_with_slicing_equal_plain_execution(scenes, seed, moves):
     task = task_over(scenes["household"][0].world.scene)
     walk(scenes["household"], task, seed, [(back, plan_of(task, "; ".join(calls))) for back, calls in moves])
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_return_in_physical_mode_equals_executing_the_calls_again(seed):
+    scene = kitchen_scene()
+    task = task_over(scene)
+    *start, last = plan_of(
+        task, "move apple_1; pick_up apple_1; pick_up mug_1; move countertop_1; place countertop_1 ontop"
+    )
+    with contextlib.closing(physical_simulator(Bundle(scene, {}))) as simulator:
+        simulator.reset(task, seed)
+        assert [simulator.run_step(call).ok for call in start] == [True, True, False, True]
+        mark = simulator.mark()
+        first = (simulator.run_step(last), seen(simulator, task))
+        simulator.return_to(mark)
+        simulator.run_step(plan_of(task, "move breakfast_table_1")[0])
+        simulator.return_to(mark)
+        assert (simulator.run_step(last), seen(simulator, task)) == first
