@@ -45,6 +45,7 @@ from embomatrix.manager.runtime.serialization import (
     window_row,
 )
 from embomatrix.manager.settings import ManagerSettings
+from embomatrix.manager.store.opening import open_store
 from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, ShelfRow, StateError, readable
 from embomatrix.manager.store.redis import _row as redis_row
 from embomatrix.manager.web.gallery import _parsed as layout_tree
@@ -111,7 +112,8 @@ def _request_head(data: bytes) -> object:
 
 @functools.cache
 def _rules() -> tuple[HttpRules, ...]:
-    open_gate, guarded = Gate(None, guarded=False), Gate(None, guarded=True, shared_token="secret")  # type: ignore[arg-type]
+    store = open_store("memory:")
+    open_gate, guarded = Gate(store, guarded=False), Gate(store, guarded=True, shared_token="secret")
     hosts = frozenset({"localhost", "127.0.0.1", "manager.lab"})
     return (HttpRules(open_gate, frozenset()), HttpRules(guarded, hosts, secure=True))
 
@@ -196,7 +198,7 @@ def _archive(data: bytes) -> object:
 def _archived() -> list[bytes]:
     kept = admin_service_pb2.KeptRun()
     kept.summary.run.run_id, kept.summary.series.step_s = "run-1", 1.0
-    kept.events.add(sequence=1, at_s=1.0, kind=1, run_id="run-1")  # type: ignore[arg-type]
+    kept.events.add(sequence=1, at_s=1.0, kind=admin_service_pb2.EVENT_KIND_RUN_OPENED, run_id="run-1")
     plain = kept.SerializeToString()
     return [plain, gzip.compress(plain)]
 

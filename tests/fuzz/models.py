@@ -89,7 +89,7 @@ def _chat_reply(data: bytes) -> object:
     reply = _reply(found, "model", 0.1, 0)
     httpx.Request("POST", "http://localhost", json={"content": reply.text}).read()
     json.dumps(asdict(reply), ensure_ascii=False).encode()
-    Ledger(None, price=Price(0.5, 1.5))._cost(reply)  # type: ignore[arg-type]
+    Ledger(_Parrot(reply.text), price=Price(0.5, 1.5))._cost(reply)
     return reply
 
 

@@ -16,7 +16,10 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from tests.fuzz.decoder import Mutate
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 FOUND: Final = ROOT / "build" / "fuzz"
@@ -153,10 +156,10 @@ def _search_unguided(part: str, name: str, seconds: float) -> int:
     return 0
 
 
-def several(mutate: object, data: bytes, rng: random.Random) -> bytes:
+def several(mutate: Mutate, data: bytes, rng: random.Random) -> bytes:
     """Return the input after one to four changes."""
     for _ in range(rng.randint(1, 4)):
-        data = mutate(data, rng)  # type: ignore[operator]
+        data = mutate(data, rng)
     return data
 
 

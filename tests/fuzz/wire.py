@@ -252,7 +252,8 @@ def _sound() -> Mapping[str, list[Message]]:
     session.state.running.append(ref)
     session.state.finished.append(result)
     failed = worker_service_pb2.LeaseResult(lease=ref)
-    failed.infra_failure.code, failed.infra_failure.message = 3, "signal 11"  # type: ignore[assignment]
+    failed.infra_failure.code = types_pb2.INFRA_CODE_SLOT_CRASHED
+    failed.infra_failure.message = "signal 11"
     session.results.extend([result, failed])
     beat = worker_service_pb2.HeartbeatRequest(session_id="s-1", session_epoch=1, running=[ref], load=0.5)
     beat.progress.add(ref=ref, steps=2)

@@ -5,6 +5,7 @@ Unlike a closed connection, a lost packet tells nobody anything. The machines ar
 
 import asyncio
 import collections
+import contextlib
 import functools
 import random
 import time
@@ -69,21 +70,33 @@ WAYS = {
 }
 
 
+@contextlib.asynccontextmanager
+async def busy_cluster(network, folder, rollouts):
+    """Run a cluster of two workers whose trainer has received the first of its results."""
+    with SplitCluster(folder, network, **QUICK) as cluster:
+        cluster.start_manager()
+        for name in (WORKER, OTHER):
+            cluster.start_worker(name)
+        cluster.start_far_trainer(rollouts, "brief")
+        await until(lambda: len(cluster.received()) >= 20, limit_s=30.0)
+        yield cluster
+
+
+async def cut(network, ways, for_s):
+    """Lose all packets of these directions for a time."""
+    for way in ways:
+        network.lose(*way)
+    await asyncio.sleep(for_s)
+    for way in ways:
+        network.pass_again(*way)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cut_s", [3.0, 20.0])
 @pytest.mark.parametrize("ways", WAYS.values(), ids=WAYS)
 async def test_lost_packets_of_one_direction_change_no_outcome(network, tmp_path, ways, cut_s):
-    with SplitCluster(tmp_path, network, **QUICK) as cluster:
-        cluster.start_manager()
-        for name in (WORKER, OTHER):
-            cluster.start_worker(name)
-        cluster.start_far_trainer(200, "brief")
-        await until(lambda: len(cluster.received()) >= 20, limit_s=30.0)
-        for way in ways:
-            network.lose(*way)
-        await asyncio.sleep(cut_s)
-        for way in ways:
-            network.pass_again(*way)
+    async with busy_cluster(network, tmp_path, 200) as cluster:
+        await cut(network, ways, cut_s)
         healed_s = time.monotonic()
         await finished(cluster, 200)
         print(
@@ -98,20 +111,10 @@ async def test_any_order_of_cuts_gives_each_rollout_one_outcome_and_no_other_rew
     rng = random.Random(seed)
     ends = [(name, MANAGER) for name in (WORKER, OTHER, TRAINER)]
     ways = [*ends, *((receiver, sender) for sender, receiver in ends)]
-    with SplitCluster(tmp_path, network, **QUICK) as cluster:
-        cluster.start_manager()
-        for name in (WORKER, OTHER):
-            cluster.start_worker(name)
-        cluster.start_far_trainer(1_500, "brief")
-        await until(lambda: len(cluster.received()) >= 20, limit_s=30.0)
+    async with busy_cluster(network, tmp_path, 1_500) as cluster:
         cuts, ends_s = 0, time.monotonic() + 60.0
         while time.monotonic() < ends_s and cluster.trainer_status() is None:
-            cut = rng.sample(ways, rng.randint(1, 4))
-            for way in cut:
-                network.lose(*way)
-            await asyncio.sleep(rng.choice((0.1, 0.5, 1.5, 4.0)))
-            for way in cut:
-                network.pass_again(*way)
+            await cut(network, rng.sample(ways, rng.randint(1, 4)), rng.choice((0.1, 0.5, 1.5, 4.0)))
             cuts += 1
             await asyncio.sleep(rng.uniform(0.0, 3.0))
         # A rollout that was lost three times ends as a failure of the infrastructure, and its group with it.

@@ -8,43 +8,34 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
-
-from embomatrix.skills.trace import Step, Trace
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
 
 if TYPE_CHECKING:
     from embomatrix.sim.executor import Mark, Simulator
     from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.skills.trace import Step, Trace
     from embomatrix.world.task import Task
 
 NODES_KEPT: Final = 4_000
 """Nodes in memory, about 3 kB each."""
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class Ending(Generic[T]):
-    """Answer to plans that end at a node: all of the trace but the steps, and the caller's judgement."""
-
-    touched: frozenset[str]
-    final: tuple[str, ...]
-    digest: str
-    judgement: T
+_Key: TypeAlias = "SkillCall | tuple[str, int]"
 
 
 @dataclass(slots=True, eq=False)
 class _Node(Generic[T]):
-    """State after a call. A root stands for the start, without a call."""
+    """State after a call, or the start of a task with a seed, whose parent is the tree's root."""
 
-    parent: _Node[T] | None
-    key: object
-    """Key in the parent's children: the call. For a root, task id and seed."""
+    parent: _Node[T] | None = None
+    key: _Key = ("", 0)
+    """Key in the parent's children: the call, or for a start task id and seed."""
     step: Step | None = None
     mark: Mark | None = None
-    ending: Ending[T] | None = None
-    children: dict[SkillCall, _Node[T]] = field(default_factory=dict)
+    ending: tuple[Trace, T] | None = None
+    """Trace and judgement of a plan that ends here. Those of other plans differ in the plan alone."""
+    children: dict[_Key, _Node[T]] = field(default_factory=dict)
 
 
 class TransitionTree(Generic[T]):
@@ -57,9 +48,9 @@ class TransitionTree(Generic[T]):
         self._simulator = simulator
         self._judge = judge
         self._most = most
-        self._roots: dict[tuple[str, int], _Node[T]] = {}
+        self._root: _Node[T] = _Node()
         self._nodes: OrderedDict[_Node[T], None] = OrderedDict()
-        """All nodes. Those not used for longest are first, and a node always before its parent."""
+        """All nodes but the root. Those not used for longest are first, and a node always before its parent."""
         self._here: _Node[T] | None = None
         """Node with the simulator's state; None if unknown."""
 
@@ -73,7 +64,7 @@ class TransitionTree(Generic[T]):
 
         Equal to ``Simulator.execute`` and a judgement of the final state. ``on_step`` receives the number of finished steps.
         """
-        node = self._root(task, seed)
+        node = self._start(task, seed)
         steps: list[Step] = []
         for call in plan:
             known = node.children.get(call)
@@ -92,21 +83,19 @@ class TransitionTree(Generic[T]):
                 on_step(len(steps))
                 if not steps[-1].ok:
                     break
-        ending = node.ending
-        if ending is None:
+        if node.ending is None:
             self._go_to(node, task, seed)
-            end = self._simulator.trace(task, (), ())
-            ending = node.ending = Ending(end.touched, end.final, end.digest, self._judge(task))
+            node.ending = self._simulator.trace(task, plan, steps), self._judge(task)
         self._use(node)
-        trace = Trace(plan, tuple(steps), ending.touched, ending.final, ending.digest)
-        return trace, ending.judgement, shared
+        trace, judgement = node.ending
+        return replace(trace, plan=plan), judgement, shared
 
-    def _root(self, task: Task, seed: int) -> _Node[T]:
+    def _start(self, task: Task, seed: int) -> _Node[T]:
         key = (task.task_id, seed)
-        root = self._roots.get(key)
-        if root is None:
-            root = self._roots[key] = _Node(None, key)
-        return root
+        start = self._root.children.get(key)
+        if start is None:
+            start = self._root.children[key] = _Node(self._root, key)
+        return start
 
     def _run(self, node: _Node[T], call: SkillCall) -> _Node[T]:
         """Execute a call at the simulator's present node."""
@@ -127,19 +116,16 @@ class TransitionTree(Generic[T]):
 
     def _use(self, node: _Node[T]) -> None:
         """Note that a node and its ancestors were used, and forget nodes beyond the limit."""
-        last: _Node[T] | None = node
-        while last is not None:
-            self._nodes[last] = None
-            self._nodes.move_to_end(last)
-            last = last.parent
+        while node.parent is not None:
+            self._nodes[node] = None
+            self._nodes.move_to_end(node)
+            node = node.parent
         while len(self._nodes) > self._most:
             oldest, _ = self._nodes.popitem(last=False)
             if oldest is self._here:
                 self._here = None
-            if oldest.parent is None:
-                del self._roots[oldest.key]  # type: ignore[arg-type]
-            else:
-                del oldest.parent.children[oldest.key]  # type: ignore[arg-type]
+            assert oldest.parent is not None
+            del oldest.parent.children[oldest.key]
 
 
 def _step_of(node: _Node[T]) -> Step:

@@ -36,7 +36,7 @@ def seen(simulator, task):
     world = simulator.world
     box = {item.name: world.engine.aabb(item.name) for item in world.scene.objects}
     return (
-        simulator._hash.hexdigest(),
+        simulator.mark().hash.hexdigest(),
         world.state_bytes(),
         simulator.touched,
         simulator.survey(task),
@@ -69,21 +69,43 @@ def walk(simulators, task, seed, moves):
         assert seen(walker, task) == seen(plain, task)
 
 
+def moves_of(calls, most_back, most_calls, most_moves):
+    """Return a strategy of moves: how far to go back, and the calls that follow."""
+    return st.lists(
+        st.tuples(st.integers(0, most_back), st.lists(calls, min_size=1, max_size=most_calls)),
+        max_size=most_moves,
+    )
+
+
+def walk_in(simulators, seed, moves):
+    task = task_over(simulators[0].world.scene)
+    walk(simulators, task, seed, [(back, plan_of(task, "; ".join(calls))) for back, calls in moves])
+
+
 @settings(max_examples=40, deadline=None)
-@given(
-    SEEDS,
-    st.lists(st.tuples(st.integers(0, 40), st.lists(CALL_SEQUENCES, min_size=1, max_size=3)), max_size=6),
-)
+@given(SEEDS, moves_of(CALL_SEQUENCES, 40, 3, 6))
 def test_walk_in_the_kitchen_equals_plain_execution(scenes, seed, moves):
-    task = task_over(scenes["kitchen"][0].world.scene)
-    walk(scenes["kitchen"], task, seed, [(back, plan_of(task, "; ".join(calls))) for back, calls in moves])
+    walk_in(scenes["kitchen"], seed, moves)
 
 
 @settings(max_examples=40, deadline=None)
-@given(SEEDS, st.lists(st.tuples(st.integers(0, 40), st.lists(CALLS, min_size=1, max_size=5)), max_size=6))
+@given(SEEDS, moves_of(CALLS, 40, 5, 6))
 def test_walk_with_slicing_and_cleaning_equals_plain_execution(scenes, seed, moves):
-    task = task_over(scenes["household"][0].world.scene)
-    walk(scenes["household"], task, seed, [(back, plan_of(task, "; ".join(calls))) for back, calls in moves])
+    walk_in(scenes["household"], seed, moves)
+
+
+@pytest.mark.slow
+@settings(max_examples=5_000, deadline=None)
+@given(SEEDS, moves_of(CALL_SEQUENCES, 60, 3, 9))
+def test_five_thousand_walks_in_the_kitchen_equal_plain_execution(scenes, seed, moves):
+    walk_in(scenes["kitchen"], seed, moves)
+
+
+@pytest.mark.slow
+@settings(max_examples=5_000, deadline=None)
+@given(SEEDS, moves_of(CALLS, 60, 5, 9))
+def test_five_thousand_walks_with_slicing_equal_plain_execution(scenes, seed, moves):
+    walk_in(scenes["household"], seed, moves)
 
 
 def test_running_water_that_was_undone_acts_again(scenes):
@@ -99,25 +121,6 @@ def test_running_water_that_was_undone_acts_again(scenes):
     simulator.return_to(mark)
     assert simulator.run_step(on) == first
     assert "soaked" in first.message
-
-
-@pytest.mark.slow
-@settings(max_examples=5_000, deadline=None)
-@given(
-    SEEDS,
-    st.lists(st.tuples(st.integers(0, 60), st.lists(CALL_SEQUENCES, min_size=1, max_size=3)), max_size=9),
-)
-def test_ten_thousand_walks_in_the_kitchen_equal_plain_execution(scenes, seed, moves):
-    task = task_over(scenes["kitchen"][0].world.scene)
-    walk(scenes["kitchen"], task, seed, [(back, plan_of(task, "; ".join(calls))) for back, calls in moves])
-
-
-@pytest.mark.slow
-@settings(max_examples=5_000, deadline=None)
-@given(SEEDS, st.lists(st.tuples(st.integers(0, 60), st.lists(CALLS, min_size=1, max_size=5)), max_size=9))
-def test_ten_thousand_walks_with_slicing_equal_plain_execution(scenes, seed, moves):
-    task = task_over(scenes["household"][0].world.scene)
-    walk(scenes["household"], task, seed, [(back, plan_of(task, "; ".join(calls))) for back, calls in moves])
 
 
 @pytest.mark.parametrize("seed", [0, 5])

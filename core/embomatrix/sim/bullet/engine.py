@@ -95,12 +95,7 @@ class BulletEngine:
 
     def reset(self) -> None:
         for number in sorted(self._changed):
-            item = self._scene.objects[number]
-            self._present[number] = not item.absent
-            self._poses[number] = item.pose_world_asset
-            self._fractions[number] = tuple(item.joints)
-            self._bodies.leave_behind(number)
-            self._bound(number, self._boxes_at_start[number])
+            self._take_on(number, self._placed_at_start(number))
         self._changed.clear()
         self._chunks.clear()
         self._all_chunks = b""
@@ -116,10 +111,13 @@ class BulletEngine:
             if target == self._placed(number):
                 continue
             self._note(number)
-            self._poses[number], self._fractions[number] = target.pose, target.fractions
-            self._present[number] = target.present
-            self._bodies.leave_behind(number)
-            self._bound(number, target.box)
+            self._take_on(number, target)
+
+    def _take_on(self, number: int, place: Placed) -> None:
+        self._poses[number], self._fractions[number] = place.pose, place.fractions
+        self._present[number] = place.present
+        self._bodies.leave_behind(number)
+        self._bound(number, place.box)
 
     def _placed(self, number: int) -> Placed:
         return Placed(
