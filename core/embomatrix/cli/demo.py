@@ -74,6 +74,9 @@ def demo(
 def _ensure_tasks(dataset: Path, seed: int) -> None:
     """Build the dataset if it is missing."""
     if (dataset / "tasks.jsonl").exists():
+        console.print(
+            f"tasks of {dataset}, which was built before; another --dataset makes new ones", highlight=False
+        )
         return
     console.rule("tasks")
     # Skip the reachability check for physical mode, which a demo does not need.
