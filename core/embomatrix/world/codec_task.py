@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from embomatrix.world.bddl import BddlError, parse_formula
-from embomatrix.world.evaluate import GoalError, check_size, objects_of, scored_atoms
+from embomatrix.world.evaluate import GoalError, check_size, objects_of
 from embomatrix.world.placements import flattened
 from embomatrix.world.poses import PoseCache
 from embomatrix.world.records import PosesJson, SceneInvalidError, TaskJson
@@ -40,10 +40,10 @@ def task_of(record: TaskJson, path: str) -> Task:
     try:
         goal = parse_formula(record.goal, {**dict.fromkeys(record.table, ""), **members})
         missing = objects_of(goal, record.types) - set(record.table)
-        check_size(goal, record.types)
+        scored = check_size(goal, record.types)
     except (BddlError, GoalError) as error:
         raise SceneInvalidError(f"{path}.goal", str(error)) from error
-    if not scored_atoms(goal, record.types):
+    if not scored:
         raise SceneInvalidError(
             f"{path}.goal", "has no scored atom, so it holds whatever the robot does: expected one"
         )

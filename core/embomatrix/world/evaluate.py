@@ -124,8 +124,8 @@ def ground_size(formula: Formula, types: Types) -> int:
             return max(1, members * ground_size(body, types))
 
 
-def check_size(goal: Formula, types: Types) -> None:
-    """Raise GoalError for a goal that becomes too many atoms: nested quantifiers multiply."""
+def check_size(goal: Formula, types: Types) -> int:
+    """Return the number of scored atoms. Raises GoalError for a goal that becomes too many: nested quantifiers multiply."""
     size = ground_size(goal, types)
     if size > MAX_GROUND:
         raise GoalError(
@@ -134,6 +134,7 @@ def check_size(goal: Formula, types: Types) -> None:
     scored = len(scored_atoms(goal, types))
     if scored > MAX_ATOMS:
         raise GoalError(f"the goal has {scored:,} scored atoms: expected at most {MAX_ATOMS:,}")
+    return scored
 
 
 def expand(formula: Formula, types: Types) -> Atom | Not | And | Or | Quantified:

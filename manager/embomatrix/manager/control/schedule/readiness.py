@@ -33,6 +33,9 @@ class _Measured:
         self.usual_load_s = median_low(self.load_s.values()) if self.load_s else 0.0
 
 
+_UNKNOWN: Final = _Measured()
+
+
 class SceneCosts:
     """Measured memory, load time and execution time of scenes. Times are 0 before the first measurement.
 
@@ -47,13 +50,11 @@ class SceneCosts:
         """Execution time on a slot of speed 1."""
 
     def size_mb(self, scene: str) -> float:
-        known = self._scenes.get(scene)
-        return known.usual_mb or self._guess_mb if known is not None else self._guess_mb
+        return self._scenes.get(scene, _UNKNOWN).usual_mb or self._guess_mb
 
     def load_s(self, scene: str) -> float:
         """Return the load time of the scene; 0 while it is unknown."""
-        known = self._scenes.get(scene)
-        return known.usual_load_s if known is not None else 0.0
+        return self._scenes.get(scene, _UNKNOWN).usual_load_s
 
     def usual_load_s(self, scene: str) -> float:
         """Return the load time of the scene, or of a typical one."""
@@ -65,22 +66,20 @@ class SceneCosts:
         if known is None:
             known = self._scenes[resident.bundle_digest] = _Measured()
             keep_newest(self._scenes, KNOWN_SCENES)
-        changed = False
+        changed, loaded = False, resident.state is ResidentState.WARM and resident.load_s > 0
         if resident.memory_mb > known.memory_mb.get(worker_id, 0.0):
             known.memory_mb[worker_id] = resident.memory_mb
             keep_newest(known.memory_mb, WITNESSES)
             changed = True
-        if resident.state is ResidentState.WARM and resident.load_s > 0:
-            load_s = min(resident.load_s, BELIEVED_S)
-            if load_s != known.load_s.get(worker_id):
-                known.load_s[worker_id] = load_s
-                keep_newest(known.load_s, WITNESSES)
-                changed = True
-            if changed:
-                known.update()
-            self.typical_load_s = _averaged(self.typical_load_s, known.usual_load_s)
-        elif changed:
+        load_s = min(resident.load_s, BELIEVED_S)
+        if loaded and load_s != known.load_s.get(worker_id):
+            known.load_s[worker_id] = load_s
+            keep_newest(known.load_s, WITNESSES)
+            changed = True
+        if changed:
             known.update()
+        if loaded:
+            self.typical_load_s = _averaged(self.typical_load_s, known.usual_load_s)
 
     def forget(self, worker_id: str) -> None:
         """Drop the measurements of a worker that left."""

@@ -85,9 +85,6 @@ class WorkerResidency:
             return
         since_s = self.warm_since_s if resident.state is ResidentState.WARM else self.loading_since_s
         since_s.setdefault(scene, now_s)
-        self._forget_failure(scene)
-
-    def _forget_failure(self, scene: str) -> None:
         self.failed_s.pop(scene, None)
         self.failure_messages.pop(scene, None)
 
