@@ -7,14 +7,6 @@ import pytest
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 
 
-@pytest.fixture(autouse=True)
-def heed_interrupts():
-    """A test run in the background of a script ignores Ctrl-C from its start."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def interrupt():
     signal.raise_signal(signal.SIGINT)
 
