@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.world.task import Profile
 
-LARGEST_SEED = 2**31 - 1
+LARGEST_SEED = 2**32 - 1
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def run(out, cluster=None, tasks=TASKS, resume=False, display=None, **changes):
     start = RunStart(settings, tasks, policy, progress, reference)
     display = display or LineDisplay(Console(quiet=True))
     with (
-        Gateway(lambda: cluster, tasks.bundle_bytes, run_name="test", run_seed=0) as gateway,
+        Gateway(lambda: cluster, tasks.bundle_bytes, run_name="test") as gateway,
         display,
     ):
         return TrainingRun(start, gateway, display, out).run(), policy

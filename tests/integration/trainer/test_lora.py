@@ -105,7 +105,7 @@ def train(out, changes, *, resume=False):
         policy = new_policy(settings, TASKS)
     start = RunStart(settings, TASKS, policy, progress, reference)
     display = LineDisplay(Console(quiet=True))
-    with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="lora", run_seed=0) as gateway:
+    with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="lora") as gateway:
         summary = TrainingRun(start, gateway, display, out).run()
     return policy, summary
 

@@ -70,7 +70,7 @@ def test_non_finite_numbers_are_not_reported():
 
 def test_latest_reports_are_queued_for_an_unreachable_manager():
     cluster = AwayCluster(TASKS)
-    with Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=0) as gateway:
+    with Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test") as gateway:
         for step in range(MAX_QUEUED_REPORTS + 10):
             gateway.report(TrainingReport("grpo", step, {"reward": 0.0}))
         assert cluster.reports == []
@@ -81,7 +81,7 @@ def test_latest_reports_are_queued_for_an_unreachable_manager():
 def test_manager_that_rejects_reports_gets_no_more():
     cluster = AwayCluster(TASKS)
     cluster.error = PreconditionError("no such call")
-    with Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=0) as gateway:
+    with Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test") as gateway:
         gateway.report(TrainingReport("grpo", 1))
         gateway.announce({}, 1)
         gateway.close_run()

@@ -12,7 +12,7 @@ from embomatrix.rpc.wire.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
 from embomatrix.trainer.cluster.gateway import Gateway, result_of
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import group_seed
+from embomatrix.trainer.data.tasks import evaluation_seed, training_seed
 
 TASKS = make_tasks(6, 2)
 TASK = TASKS.train[0]
@@ -20,12 +20,12 @@ ORACLE = plan_in_names(TASK.oracle, TASK.situation)
 
 
 def gateway(cluster, **options):
-    return Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=7, **options)
+    return Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", **options)
 
 
 def outcomes(cluster, *texts, **options):
     with gateway(cluster, **options) as gate:
-        return result_of(gate.submit("b", 1, TASK, TASK.situation, texts, Codec.NAMES))
+        return result_of(gate.submit("b", 1, TASK, TASK.situation, texts, Codec.NAMES, 5))
 
 
 def until(condition, seconds=10.0):
@@ -71,7 +71,9 @@ def test_bundle_is_uploaded_once_before_its_first_rollout():
     cluster = SymbolicCluster(TASKS)
     with gateway(cluster) as gate:
         gate.announce({1: TASKS.train[:2], 2: TASKS.train[2:4]}, 8)
-        futures = [gate.submit(f"b{at}", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES) for at in range(3)]
+        futures = [
+            gate.submit(f"b{at}", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES, 5) for at in range(3)
+        ]
         assert all(result_of(future)[0].success for future in futures)
         until(lambda: cluster.announced)
     assert cluster.sent == {task.bundle_digest for task in (*TASKS.train[:4], TASK)}
@@ -101,7 +103,7 @@ def test_exit_does_not_wait_for_an_unreachable_manager():
     cluster = Away(TASKS)
     cluster.refused = -1_000_000
     with gateway(cluster) as gate:
-        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES)
+        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES, 5)
         until(lambda: cluster.refused > -1_000_000)
     assert cluster.closed
     assert cluster.sent == set()
@@ -110,7 +112,7 @@ def test_exit_does_not_wait_for_an_unreachable_manager():
 def test_exit_closes_the_run_with_pending_work():
     cluster = SymbolicCluster(TASKS, delay_s=60)
     with gateway(cluster) as gate:
-        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES)
+        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES, 5)
     assert cluster.closed
 
 
@@ -124,7 +126,10 @@ def test_unreachable_manager_gives_a_one_sentence_error():
         pass
 
 
-def test_rollouts_share_a_seed_per_task_and_run():
-    assert group_seed(0, "a") == group_seed(0, "a")
-    assert len({group_seed(0, "a"), group_seed(0, "b"), group_seed(1, "a")}) == 3
-    assert 0 <= group_seed(0, "a") < 2**31
+def test_training_and_evaluation_use_different_seeds():
+    trained = {training_seed(0, "a"), training_seed(0, "b"), training_seed(1, "a"), training_seed(0, "a", 1)}
+    evaluated = {evaluation_seed(0, "a"), evaluation_seed(0, "b"), evaluation_seed(1, "a")}
+    assert (len(trained), len(evaluated)) == (4, 3)
+    assert all(0 <= seed < 2**31 for seed in evaluated)
+    assert all(2**31 <= seed < 2**32 for seed in trained)
+    assert training_seed(0, "a") == training_seed(0, "a", 0)

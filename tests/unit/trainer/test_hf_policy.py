@@ -186,7 +186,7 @@ def train(policy, out, **changes):
     )
     start = RunStart(settings, TASKS, policy, TrainingProgress())
     display = LineDisplay(Console(quiet=True))
-    with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="hf", run_seed=0) as gateway:
+    with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="hf") as gateway:
         return TrainingRun(start, gateway, display, out).run()
 
 

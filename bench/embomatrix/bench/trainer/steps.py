@@ -81,6 +81,7 @@ class LengthScore:
         situation: Situation,
         texts: Sequence[str],
         codec: Codec,
+        seed: int,
     ) -> Future[tuple[PlanOutcome, ...]]:
         done: Future[tuple[PlanOutcome, ...]] = Future()
         done.set_result(
@@ -106,7 +107,9 @@ def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
     for step in range(load.unmeasured + load.steps):
         chosen = [tasks[(step * load.tasks + at) % len(tasks)] for at in range(load.tasks)]
         began_s = time.process_time()
-        updater.take_step(StepPlan(step, chosen, (), (), np.random.default_rng, generator, rate_factor=1.0))
+        updater.take_step(
+            StepPlan(step, chosen, (), (), np.random.default_rng, generator, lambda *_: 0, rate_factor=1.0)
+        )
         spent_s.append(time.process_time() - began_s)
     torch.set_num_threads(threads)
     return spent_s[load.unmeasured :]

@@ -19,13 +19,14 @@ from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.trainer.adapters.rows import messages, tasks_of
 from embomatrix.trainer.adapters.scorer import PlanScorer, shared_scorer
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import group_seed, load_tasks
+from embomatrix.trainer.data.tasks import evaluation_seed, load_tasks, training_seed
 
 DATASET: Final = "EMBOMATRIX_DATASET"
 
 
 def rows(dataset: str | Path, split: str = "train", seed: int = 0) -> list[dict[str, Any]]:
     """``{"input": messages, "label": text}`` for each task of a split: ``--data.input_key input --data.label_key label``."""
+    seed_of = training_seed if split == "train" else evaluation_seed
     return [
         {
             "input": messages(task.situation),
@@ -33,7 +34,7 @@ def rows(dataset: str | Path, split: str = "train", seed: int = 0) -> list[dict[
                 task.task.task_id,
                 task.bundle_digest,
                 task.task.profile,
-                group_seed(seed, task.task.task_id),
+                seed_of(seed, task.task.task_id),
             ).text(),
         }
         for task in tasks_of(dataset, split)

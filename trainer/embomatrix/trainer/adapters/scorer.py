@@ -29,7 +29,7 @@ from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks
+from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks, training_seed
 
 RUN_NAME: Final = "adapter"
 GROUPING_S: Final = 0.005
@@ -98,7 +98,6 @@ class PlanScorer:
                     self._open_cluster,
                     tasks.bundle_bytes,
                     run_name=RUN_NAME,
-                    run_seed=self._seed,
                     terms=self._terms,
                 )
                 try:
@@ -137,7 +136,13 @@ class PlanScorer:
             chosen = [texts[index] for index in indices]
             task = tasks[task_id]
             future = opened.gateway.submit(
-                f"score-{number}", number, task, task.situation, chosen, Codec.JSON
+                f"score-{number}",
+                number,
+                task,
+                task.situation,
+                chosen,
+                Codec.JSON,
+                training_seed(self._seed, task_id),
             )
             pending.append((indices, future))
         return pending

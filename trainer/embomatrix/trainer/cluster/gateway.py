@@ -39,7 +39,7 @@ from embomatrix.skills.prompt import Codec, Situation, with_indices
 from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Step
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import TrainingTask, group_seed
+from embomatrix.trainer.data.tasks import TrainingTask
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -107,8 +107,9 @@ class PlanSubmitter(Protocol):
         situation: Situation,
         texts: Sequence[str],
         codec: Codec,
+        seed: int,
     ) -> Future[tuple[PlanOutcome, ...]]:
-        """Execute one task's plans. Outcomes keep the order of ``texts``."""
+        """Execute one task's plans, all with this seed. Outcomes keep the order of ``texts``."""
         ...
 
 
@@ -120,7 +121,8 @@ def parse_policy_text(text: str, situation: Situation, codec: Codec) -> Plan:
 class Gateway:
     """Context manager over one run of the cluster. Call ``submit`` from any thread, all other methods from the trainer's.
 
-    ``terms`` set the policy for groups that lost a rollout, and the reward's coefficients.
+    ``terms`` set the policy for groups that lost a rollout, and the reward's coefficients. ``on_submit`` gets every batch that
+    has rollouts, on the gateway's thread.
     """
 
     def __init__(
@@ -129,14 +131,14 @@ class Gateway:
         bundle_bytes: Callable[[str], bytes],
         *,
         run_name: str,
-        run_seed: int,
         terms: RunTerms = DEFAULT_TERMS,
+        on_submit: Callable[[Batch], None] = lambda _: None,
     ) -> None:
         self._open_cluster = open_cluster
         self._bundle_bytes = bundle_bytes
         self._run_name = run_name
-        self._run_seed = run_seed
         self._terms = terms
+        self._on_submit = on_submit
         self._announced = 0
         self._uploads: dict[str, asyncio.Task[None]] = {}
         self._reports: deque[TrainingReport] = deque(maxlen=MAX_QUEUED_REPORTS)
@@ -264,8 +266,9 @@ class Gateway:
         situation: Situation,
         texts: Sequence[str],
         codec: Codec,
+        seed: int,
     ) -> Future[tuple[PlanOutcome, ...]]:
-        """Start the rollouts of one task's plans. Outcomes keep the order of ``texts``.
+        """Start the rollouts of one task's plans, all with this seed. Outcomes keep the order of ``texts``.
 
         ``situation`` is the varied situation of the prompt, which resolves the object names in the texts.
         """
@@ -279,7 +282,7 @@ class Gateway:
                 bundle_digest=task.bundle_digest,
                 task_id=task.task.task_id,
                 plan=plan,
-                seed=group_seed(self._run_seed, task.task.task_id),
+                seed=seed,
             )
             for index, plan in enumerate(plans)
             if not isinstance(plan, PlanOutcome)
@@ -293,6 +296,7 @@ class Gateway:
     ) -> tuple[PlanOutcome, ...]:
         outcomes: dict[str, Outcome] = {}
         if batch.rollouts:
+            self._on_submit(batch)
             await self._upload_once(batch.rollouts[0].bundle_digest)
             async for result in self._cluster.execute(batch):
                 outcomes[result.rollout_id] = result.outcome

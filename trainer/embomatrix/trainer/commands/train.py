@@ -22,6 +22,7 @@ from embomatrix.rpc.trust import read_ca, read_token
 from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
+    from embomatrix.rpc.wire.values import Batch
     from embomatrix.trainer.lifecycle.checkpoint import ImitationState
     from embomatrix.trainer.logging.report import TrainingSummary
     from embomatrix.trainer.run.starting import RunStart
@@ -86,6 +87,9 @@ def train(
     processes: _PROCESSES = None,
     device: _DEVICE = None,
     track: _TRACK = None,
+    record: Annotated[
+        Path | None, typer.Option(help="File for every submitted plan, to replay with `bench traffic`.")
+    ] = None,
     token: Token = "",
     ca: Ca = None,
     log_format: _LOG_FORMAT = None,
@@ -108,7 +112,7 @@ def train(
             **_coefficients(reward or ()),
         }
         start = _start(dataset, out, model, settings_file, changes, resume=resume)
-        _show_summary(_run(start, connect, out))
+        _show_summary(_run(start, connect, out, record))
 
 
 def imitate(
@@ -188,7 +192,7 @@ def _coefficients(options: Sequence[str]) -> dict[str, str]:
     return {f"reward.{name}": value for name, _, value in pairs}
 
 
-def _run(start: RunStart, connect: Connect, out: Path) -> TrainingSummary:
+def _run(start: RunStart, connect: Connect, out: Path, record: Path | None) -> TrainingSummary:
     from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
     from embomatrix.trainer.cluster.gateway import Gateway
     from embomatrix.trainer.config.settings import OnLost
@@ -201,13 +205,29 @@ def _run(start: RunStart, connect: Connect, out: Path) -> TrainingSummary:
     policy_on_loss = GroupPolicy.RETRY_THEN_FAIL_GROUP if fails_group else GroupPolicy.PARTIAL
     terms = RunTerms(policy_on_loss, reward=settings.reward.settings())
     with (
+        _traffic_log(record) as on_submit,
         Gateway(
-            connect, start.tasks.bundle_bytes, run_name=out.name, run_seed=settings.seed, terms=terms
+            connect, start.tasks.bundle_bytes, run_name=out.name, terms=terms, on_submit=on_submit
         ) as gateway,
         trackers_of(settings, out) as trackers,
         display_on(Console()) as display,
     ):
         return TrainingRun(start, gateway, display, out, trackers).run()
+
+
+@contextlib.contextmanager
+def _traffic_log(path: Path | None) -> Iterator[Callable[[Batch], None]]:
+    from embomatrix.rpc.traffic import TrafficLog
+
+    if path is None:
+        yield lambda _: None
+        return
+    try:
+        log = TrafficLog(path)
+    except OSError as error:
+        raise TrainerError(f"--record {path}: it can't be written ({error.strerror})") from error
+    with contextlib.closing(log):
+        yield log.append
 
 
 def _imitated(start: RunStart, out: Path) -> ImitationState:

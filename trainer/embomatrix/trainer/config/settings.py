@@ -40,6 +40,13 @@ class Overlap(StrEnum):
     AHEAD = "ahead"  # also sample the next step's batch, from weights that are one step old
 
 
+class SeedPer(StrEnum):
+    """Time for which a task keeps the seed of its rollouts."""
+
+    TASK = "task"  # the whole run: later epochs share calls with earlier ones, but one draw can be learnt by heart
+    EPOCH = "epoch"  # one pass over all tasks
+
+
 class TrackerKind(StrEnum):
     """Experiment trackers."""
 
@@ -176,6 +183,8 @@ class GrpoSettings(_Frozen):
     max_grad_norm: float = Field(default=1.0, gt=0)
     lookahead: int = Field(default=3, ge=0)
     """Steps that are announced to the cluster ahead of time."""
+    seed_per: SeedPer = SeedPer.EPOCH
+    """Time for which a task keeps the seed of its rollouts."""
     on_lost: OnLost = OnLost.GROUP
     overlap: Overlap = Overlap.STREAM
     reserve: int = Field(default=0, ge=0)

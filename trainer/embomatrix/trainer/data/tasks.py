@@ -122,10 +122,22 @@ def training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
     return TrainingTask(task, situation_of(bundle.scene, task), record.bundle_digest, oracle)
 
 
-def group_seed(run_seed: int, task_id: str) -> int:
-    """Seed in [0, 2^31) that all rollouts of a task share in a run, so equal plans get equal rewards."""
-    digest = hashlib.sha256(f"{run_seed}:{task_id}".encode()).digest()
-    return int.from_bytes(digest[:4], "big") >> 1
+HALF: Final = 2**31
+"""Seeds below it are for evaluation, seeds from it to twice its value for training."""
+
+
+def evaluation_seed(run_seed: int, task_id: str) -> int:
+    """Seed in [0, 2^31) of all rollouts of a task in an evaluation, so equal plans get equal rewards. No training uses it."""
+    return _half(f"{run_seed}:{task_id}")
+
+
+def training_seed(run_seed: int, task_id: str, epoch: int = 0) -> int:
+    """Seed in [2^31, 2^32) of all rollouts of a task in one epoch of training."""
+    return HALF + _half(f"{run_seed}:{task_id}:{epoch}")
+
+
+def _half(text: str) -> int:
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1
 
 
 UNKNOWN_LENGTH: Final = 10_000

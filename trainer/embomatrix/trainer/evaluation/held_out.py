@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome, result_of
-from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
 from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
@@ -91,9 +91,11 @@ def evaluate_policy(
         for row, (task, prompt) in enumerate(zip(chunk, prompts, strict=True)):
             texts = drawn.texts[row * settings.samples : (row + 1) * settings.samples]
             batch_id = f"{label}-{number}-{row}"
-            pending.append(
-                (task, gateway.submit(batch_id, number, task, prompt.situation, texts, policy.codec))
+            execution_seed = evaluation_seed(seed, task.task.task_id)
+            future = gateway.submit(
+                batch_id, number, task, prompt.situation, texts, policy.codec, execution_seed
             )
+            pending.append((task, future))
     scores = []
     for task, future in pending:
         outcomes: tuple[PlanOutcome, ...] = result_of(future)

@@ -11,7 +11,7 @@ from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, limited, with_indices
 from embomatrix.skills.syntax import Plan
 from embomatrix.trainer.cluster.executor import Executor
-from embomatrix.trainer.data.tasks import group_seed
+from embomatrix.trainer.data.tasks import evaluation_seed
 from embomatrix.trainer.evaluation.benchmark import Benchmark
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
 from embomatrix.world.task import Profile
@@ -58,7 +58,9 @@ def judge_answers(
         report(len(outcomes), len(names))
 
     rollouts = [
-        Rollout(name, task_id, records[task_id].bundle_digest, task_id, plan, group_seed(setup.seed, task_id))
+        Rollout(
+            name, task_id, records[task_id].bundle_digest, task_id, plan, evaluation_seed(setup.seed, task_id)
+        )
         for name, (task_id, plan) in names.items()
     ]
     if rollouts:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -81,19 +81,21 @@ class Sampler:
         tasks: Sequence[TrainingTask],
         rng: np.random.Generator,
         generator: torch.Generator,
+        seed_of: Callable[[int, str], int],
         *,
         first_index: int = 0,
     ) -> list[SampledChunk]:
         """Sample the tasks in chunks. Each chunk is submitted before its process samples the next one.
 
-        A chunk's samples depend only on its index and ``generator``, not on the process that draws them.
+        A chunk's samples depend only on its index and ``generator``, not on the process that draws them. ``seed_of`` returns
+        the seed of a task's rollouts in a step.
         """
         size = self._settings.chunk
         jobs = []
         for index, at in enumerate(range(0, len(tasks), size), start=first_index):
             prompts = [(task, self._prompt_builder.varied(task, rng)) for task in tasks[at : at + size]]
             seed = int(torch.randint(_SEEDS, (), generator=generator, device=generator.device))
-            jobs.append((index, functools.partial(self._chunk, step, index, prompts, seed)))
+            jobs.append((index, functools.partial(self._chunk, step, index, prompts, seed, seed_of)))
         chunks = self._workers.map(jobs)
         if not self._settings.kl_coef:
             return chunks
@@ -108,6 +110,7 @@ class Sampler:
         index: int,
         prompts: Sequence[tuple[TrainingTask, TaskPrompt]],
         seed: int,
+        seed_of: Callable[[int, str], int],
         learner: Learner | RemoteLearner,
     ) -> SampledChunk:
         group = self._settings.group
@@ -120,6 +123,7 @@ class Sampler:
                 prompt.situation,
                 samples.texts[row * group : (row + 1) * group],
                 self._codec,
+                seed_of(step, task.task.task_id),
             )
             for row, (task, prompt) in enumerate(prompts)
         ]

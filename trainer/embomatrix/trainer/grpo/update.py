@@ -41,6 +41,7 @@ MAX_BAD_GRADIENTS = 5
 @dataclass(frozen=True, slots=True)
 class StepPlan:
     """Input of one step. ``rng`` returns a step's generator for prompt variation; ``generator`` draws the tokens.
+    ``seed_of`` returns the seed of a task's rollouts in a step.
 
     ``upcoming`` are the next step's tasks, sampled now with ``Overlap.AHEAD``. ``reserve`` tasks replace zero-variance
     groups, in this order. ``rate_factor`` scales the learning rate, ``relevance`` the reward's relevance tier.
@@ -52,6 +53,7 @@ class StepPlan:
     reserve: Sequence[TrainingTask]
     rng: Callable[[int], np.random.Generator]
     generator: torch.Generator
+    seed_of: Callable[[int, str], int]
     rate_factor: float
     relevance: float = 1.0
 
@@ -101,17 +103,18 @@ class Updater:
     def _chunks(self, plan: StepPlan) -> list[SampledChunk]:
         """Return this step's chunks, sampled now or one step ago. With ``AHEAD``, also sample the next step's."""
         ready, self._ahead = self._ahead, None
-        if ready is not None and ready[0] == plan.step:
-            chunks = ready[1]
-        else:
-            chunks = self._sampler.sample(plan.step, plan.tasks, plan.rng(plan.step), plan.generator)
+        sampled = ready is not None and ready[0] == plan.step
+        chunks = ready[1] if ready and sampled else self._sample(plan, plan.step, plan.tasks)
         if self._settings.overlap is Overlap.AHEAD and plan.upcoming:
             coming = plan.step + 1
-            self._ahead = (
-                coming,
-                self._sampler.sample(coming, plan.upcoming, plan.rng(coming), plan.generator),
-            )
+            self._ahead = coming, self._sample(plan, coming, plan.upcoming)
         return chunks
+
+    def _sample(
+        self, plan: StepPlan, step: int, tasks: Sequence[TrainingTask], first_index: int = 0
+    ) -> list[SampledChunk]:
+        rng = plan.rng(step)
+        return self._sampler.sample(step, tasks, rng, plan.generator, plan.seed_of, first_index=first_index)
 
     def _totals(self, chunks: Sequence[SampledChunk]) -> LossTotals:
         return LossTotals(
@@ -196,9 +199,7 @@ class Updater:
             tasks, reserve = reserve[:missing], reserve[missing:]
             replaced += len(tasks)
             with self._stopwatch.track(Activity.SAMPLING):
-                chunks = self._sampler.sample(
-                    plan.step, tasks, plan.rng(plan.step), plan.generator, first_index=next_index
-                )
+                chunks = self._sample(plan, plan.step, tasks, next_index)
             next_index += len(chunks)
             self._learn_all(chunks, state)
         if state.signal_plans:

@@ -17,7 +17,8 @@ import torch
 
 from embomatrix.host.limits import usable_cores
 from embomatrix.trainer.cluster.gateway import Gateway
-from embomatrix.trainer.data.tasks import Curriculum, Schedule
+from embomatrix.trainer.config.settings import SeedPer
+from embomatrix.trainer.data.tasks import Curriculum, Schedule, training_seed
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
 from embomatrix.trainer.grpo.learner import Learner
@@ -177,12 +178,21 @@ class TrainingRun:
             reserve=reserve.take(settings.reserve),
             rng=self._rng,
             generator=self._generator,
+            seed_of=self._seed_of,
             rate_factor=self._rate_factor(step, share),
             relevance=settings.relevance + (end - settings.relevance) * share,
         )
 
     def _rng(self, step: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, step)))
+
+    def _seed_of(self, step: int, task_id: str) -> int:
+        """Return the seed of a task's rollouts in a step. An epoch has as many draws as there are tasks."""
+        settings = self._settings.grpo
+        epoch = 0
+        if settings.seed_per is SeedPer.EPOCH:
+            epoch = (step - 1) * settings.tasks_per_step // len(self._start.tasks.train)
+        return training_seed(self._settings.seed, task_id, epoch)
 
     def _share(self) -> float:
         """Used share of the GRPO budget, at most 1."""
