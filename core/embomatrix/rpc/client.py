@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import logging
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
@@ -35,7 +36,7 @@ from embomatrix.rpc.status import (
 from embomatrix.rpc.versions import SPOKEN, agree, capabilities_of
 from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
-from embomatrix.rpc.wire.rollout import batch_to_proto
+from embomatrix.rpc.wire.rollout import batch_to_proto, merged
 from embomatrix.rpc.wire.run import (
     group_done_from_proto,
     lookahead_answer_from_proto,
@@ -91,9 +92,12 @@ class ClusterClient(AdminClient):
         *,
         ca: bytes = b"",
         limits: ClientLimits = DEFAULT_LIMITS,
+        merging: bool = True,
     ) -> None:
+        """With ``merging``, equal rollouts of a group are sent and executed once."""
         super().__init__(address, token, ca=ca, call_s=limits.call_s, failover_s=limits.failover_s)
         self._limits = limits
+        self._merging = merging
 
     @property
     def _rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
@@ -168,6 +172,8 @@ class ClusterClient(AdminClient):
         """
         within_s = self._limits.batch_s if deadline_s is None else deadline_s
         attached = _AttachedBatch(batch, within_s)
+        if self._merging:
+            attached.batch = dataclasses.replace(batch, rollouts=tuple(merged(batch.rollouts)))
         backoff = Backoff(self._limits.retry_first_s, self._limits.retry_longest_s)
         while attached.missing:
             before, cursor = len(attached.missing), attached.cursor
@@ -245,7 +251,7 @@ class _AttachedBatch:
 
     def __init__(self, batch: Batch, within_s: float) -> None:
         self.batch = batch
-        self.missing = {rollout.rollout_id for rollout in batch.rollouts}
+        self.missing = {name for rollout in batch.rollouts for name in (rollout.rollout_id, *rollout.also)}
         self.submitted = False
         self.cursor = 0
         self._groups: set[str] = set()
@@ -256,9 +262,10 @@ class _AttachedBatch:
         """Yield the results that were not seen before."""
         for result in results:
             self.cursor = max(self.cursor, result.cursor)
-            if result.rollout_id in self.missing:
-                self.missing.discard(result.rollout_id)
-                yield result
+            for one in result.each():
+                if one.rollout_id in self.missing:
+                    self.missing.discard(one.rollout_id)
+                    yield one
 
     def ended(self, groups: Sequence[GroupDone]) -> Iterable[GroupDone]:
         """Yield the groups whose end was not reported before."""
@@ -287,7 +294,7 @@ class _AttachedBatch:
 
     def _late(self) -> DeadlineError:
         return DeadlineError(
-            f"batch {self.batch.batch_id}: {len(self.missing)} of {len(self.batch.rollouts)} rollouts "
+            f"batch {self.batch.batch_id}: {len(self.missing)} of {self.batch.count} rollouts "
             f"had no outcome within {self._within_s:g} s: are workers connected? (`embomatrix status`)"
         )
 

@@ -87,7 +87,8 @@ def read_traffic(lines: Iterable[bytes]) -> Iterator[SubmittedGroup]:
             group = decoder.decode(line)
         except msgspec.MsgspecError as error:
             raise TrafficError(
-                f"line {number} of the traffic is not a submitted group ({error}): record it again with `embomatrix train --record`"
+                f"line {number} of the traffic is not a submitted group ({error}): record it again with "
+                "`embomatrix train --record`"
             ) from error
         if not all(0 <= index < len(group.plans) for index in group.members):
             raise TrafficError(f"line {number} of the traffic has a member without a plan: record it again")

@@ -83,7 +83,7 @@ def test_delivery_time_is_added_to_the_row():
     stored = rollout_result_from_proto(RolloutResultMessage.FromString(row.payload))
     timings = dataclasses.replace(result.outcome.timings, deliver_s=0.25)
     assert stored == dataclasses.replace(result, outcome=dataclasses.replace(result.outcome, timings=timings))
-    assert group_and_kind(row) == ("g1", Completed)
+    assert group_and_kind(row) == ("g1", Completed, 1)
 
 
 async def test_dropped_log_ends_its_readers():

@@ -33,6 +33,8 @@ RESULT_BYTES: Final = 64 * 1024
 """Bytes of one result of a lease."""
 RESULT_TEXT: Final = 4_000
 """Characters of a text in a result. The texts of a result with fewer bytes need no check."""
+MOST_EQUAL: Final = 63
+"""Further ids of equal rollouts in one message."""
 DAY_S: Final = 86_400.0
 
 
@@ -127,6 +129,7 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "Completed.final_state": Bound(length=RESULT_TEXT, count=HELD_LEASES),
     "Completed.trace_digest": _RESULT_TEXT,
     "Completed.worker_id": _RESULT_TEXT,
+    "Completed.shared_steps": _COUNT,
     "Reward.format": _REWARD,
     "Reward.relevance": _REWARD,
     "Reward.goal": _REWARD,
@@ -190,6 +193,7 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "Rollout.task_id": _ID,
     "Rollout.plan": Bound(count=MAX_STEPS),
     "Rollout.seed": _numbers(2.0**64),
+    "Rollout.also": Bound(length=NAME, count=MOST_EQUAL),
     "WaitExecutionRequest.run_id": _ID,
     "WaitExecutionRequest.batch_id": _ID,
     "WaitExecutionRequest.after_cursor": _EPOCH,

@@ -92,6 +92,7 @@ def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
         message.steps.extend(step_to_proto(step) for step in completed.steps)
         message.final_state.extend(completed.final)
         message.trace_digest = completed.trace_digest
+        message.shared_steps = completed.shared_steps
     message.worker_id = completed.worker_id
     message.timings.SetInParent()
     _write_timings(completed.timings, message.timings)
@@ -112,6 +113,7 @@ def completed_from_proto(message: types_pb2.Completed) -> Completed:
         worker_id=message.worker_id,
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
+        shared_steps=message.shared_steps,
     )
     object.__setattr__(completed, "wire", wire)
     return completed
@@ -129,6 +131,7 @@ def checked_completed(message: types_pb2.Completed) -> Completed:
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
         worker_id=message.worker_id,
+        shared_steps=message.shared_steps,
     )
 
 
@@ -153,7 +156,11 @@ def _read_completed(wire: bytes) -> Completed:
 
 def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:
     message = types_pb2.RolloutResult(
-        rollout_id=result.rollout_id, group_id=result.group_id, cursor=result.cursor, attempt=result.attempt
+        rollout_id=result.rollout_id,
+        group_id=result.group_id,
+        cursor=result.cursor,
+        attempt=result.attempt,
+        also=result.also,
     )
     match result.outcome:
         case Completed() as completed:
@@ -172,6 +179,7 @@ def rollout_result_from_proto(message: types_pb2.RolloutResult) -> RolloutResult
         cursor=message.cursor,
         attempt=message.attempt,
         outcome=_outcome(message),
+        also=tuple(message.also),
     )
 
 

@@ -1,11 +1,12 @@
 """Conversion of plans, rollouts and batches to and from protobuf."""
 
+import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, Literal
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
-from embomatrix.rpc.wire.bounds import check
+from embomatrix.rpc.wire.bounds import MOST_EQUAL, check
 from embomatrix.rpc.wire.codec import (
     ConvertError,
     each,
@@ -34,6 +35,8 @@ ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance"
 SKILL_KINDS: Final = enum_numbers(Skill, types_pb2.SkillKind, "SKILL_KIND")
 MAX_ROLLOUT_BYTES: Final = MAX_PLAN_BYTES + 4096
 """Largest serialized rollout: the largest plan plus its names."""
+EQUAL_CHARS: Final = 1_500
+"""Characters of the ids of equal rollouts in one message: beyond it another message begins."""
 KNOWN: Final = 65_536
 """Capacity of the cache from serialized calls and steps to values. Plans of one model repeat most calls."""
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
@@ -120,6 +123,7 @@ def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     message.plan.extend(map(skill_call_to_proto, rollout.plan))
     message.seed = rollout.seed
     message.render = rollout.render
+    message.also.extend(rollout.also)
 
 
 rollout_to_proto = maker(types_pb2.Rollout, write_rollout)
@@ -141,6 +145,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         plan=_plan_from(types_pb2.RolloutCalls.FromString(wire).plan),
         seed=message.seed,
         render=message.render,
+        also=tuple(message.also),
     )
     object.__setattr__(rollout, "wire", wire)
     return rollout
@@ -157,6 +162,30 @@ def unread_rollout(message: types_pb2.Rollout) -> Rollout:
 
 def _read_rollout(wire: bytes) -> Rollout:
     return rollout_from_proto(types_pb2.Rollout.FromString(wire))
+
+
+def merged(rollouts: Iterable[Rollout]) -> list[Rollout]:
+    """Return the rollouts with equal ones as one, in order of the first of each.
+
+    Only rollouts of one group are merged, at most as many as one message may name.
+    """
+    found: dict[tuple[object, ...], list[Rollout]] = {}
+    for one in rollouts:
+        key = (one.group_id, one.bundle_digest, one.task_id, one.seed, one.render, one.plan)
+        found.setdefault(key, []).append(one)
+    return [whole for equal in found.values() for whole in _wholes(equal)]
+
+
+def _wholes(equal: Sequence[Rollout]) -> Iterator[Rollout]:
+    """Yield equal rollouts as few."""
+    if len(equal) == 1:
+        yield equal[0]
+        return
+    names = [name for one in equal for name in (one.rollout_id, *one.also)]
+    most = min(MOST_EQUAL, EQUAL_CHARS // max(map(len, names))) + 1
+    for start in range(0, len(names), most):
+        first, *also = names[start : start + most]
+        yield dataclasses.replace(equal[0], rollout_id=first, also=tuple(also))
 
 
 def batch_to_proto(batch: Batch) -> rollout_service_pb2.ExecuteRequest:
@@ -177,12 +206,13 @@ def batch_with(message: rollout_service_pb2.ExecuteRequest, rollouts: tuple[Roll
     """Return the batch of a message whose rollouts are converted already."""
     seen: set[str] = set()
     for index, rollout in enumerate(rollouts):
-        if rollout.rollout_id in seen:
-            raise ConvertError(
-                f"rollouts[{index}].rollout_id",
-                f"found {rollout.rollout_id!r} a second time: expected unique ids",
-            )
-        seen.add(rollout.rollout_id)
+        for rollout_id in (rollout.rollout_id, *rollout.also):
+            if rollout_id in seen:
+                raise ConvertError(
+                    f"rollouts[{index}].rollout_id",
+                    f"found {rollout_id!r} a second time: expected unique ids",
+                )
+            seen.add(required(f"rollouts[{index}].also", rollout_id))
     batch = Batch(
         required("run_id", message.run_id), required("batch_id", message.batch_id), message.step, rollouts
     )

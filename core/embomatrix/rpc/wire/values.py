@@ -5,6 +5,7 @@ An outcome is a union: an infrastructure failure is a type without a reward, so 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -51,7 +52,7 @@ class _ReadWhenAsked:
 class Rollout(_ReadWhenAsked):
     """One plan to execute once. The plans of one task in one batch share ``group_id`` and ``seed``."""
 
-    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render"})
+    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render", "also"})
 
     rollout_id: str
     group_id: str
@@ -61,10 +62,17 @@ class Rollout(_ReadWhenAsked):
     seed: int
     render: bool = False
     """Needs a slot that renders on a GPU."""
+    also: tuple[str, ...] = ()
+    """Ids of further rollouts of the group that are equal in everything else: one execution serves all."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on unchanged; a modified copy has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
     """Parser of ``wire`` for the empty slots; None once everything is parsed."""
+
+    @property
+    def count(self) -> int:
+        """Number of rollouts that this one stands for."""
+        return 1 + len(self.also)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +85,11 @@ class Batch:
     rollouts: tuple[Rollout, ...]
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, as for a rollout."""
+
+    @property
+    def count(self) -> int:
+        """Number of rollouts."""
+        return sum(rollout.count for rollout in self.rollouts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +112,7 @@ class Timings:
 class Completed(_ReadWhenAsked):
     """Executed and scored plan: evidence about the policy, with any reward."""
 
-    _left = frozenset({"reward", "steps", "final", "trace_digest"})
+    _left = frozenset({"reward", "steps", "final", "trace_digest", "shared_steps"})
 
     reward: RewardBreakdown
     steps: tuple[Step, ...]
@@ -108,6 +121,8 @@ class Completed(_ReadWhenAsked):
     worker_id: str
     timings: Timings
     warm: bool
+    shared_steps: int = field(default=0, compare=False)
+    """Steps that were known from earlier rollouts and not executed. Equal plans may differ in it."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on with the ``noted`` fields replaced; a copy with other changes has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
@@ -122,7 +137,16 @@ class Completed(_ReadWhenAsked):
         warm = self.warm if warm is None else warm
         if self.read is not None:
             return Completed.unread(self.wire, self.read, timings=timings, warm=warm, worker_id=worker_id)
-        copy = Completed(self.reward, self.steps, self.final, self.trace_digest, worker_id, timings, warm)
+        copy = Completed(
+            self.reward,
+            self.steps,
+            self.final,
+            self.trace_digest,
+            worker_id,
+            timings,
+            warm,
+            self.shared_steps,
+        )
         object.__setattr__(copy, "wire", self.wire)
         return copy
 
@@ -173,6 +197,26 @@ class RolloutResult:
     cursor: int
     attempt: int
     outcome: Outcome
+    also: tuple[str, ...] = ()
+    """Ids of equal rollouts with the same outcome."""
+
+    @property
+    def count(self) -> int:
+        """Number of rollouts that have this outcome."""
+        return 1 + len(self.also)
+
+    def each(self) -> tuple[RolloutResult, ...]:
+        """Return one result for each rollout. All steps of the further ones are shared."""
+        if not self.also:
+            return (self,)
+        outcome = self.outcome
+        if isinstance(outcome, Completed):
+            outcome = dataclasses.replace(outcome, shared_steps=len(outcome.steps))
+        first = dataclasses.replace(self, also=())
+        further = (
+            RolloutResult(name, self.group_id, self.cursor, self.attempt, outcome) for name in self.also
+        )
+        return (first, *further)
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,6 +338,15 @@ class RunStats:
     """Results that were compared with another worker's."""
     audit_mismatches: int = 0
     """Audited results that differed from another worker's."""
+    steps: int = 0
+    """Steps of all completed rollouts."""
+    shared_steps: int = 0
+    """Steps that were known from equal plans or equal beginnings and not executed."""
+
+    @property
+    def shared_share(self) -> float:
+        """Share of the steps that were not executed; 0 without any steps."""
+        return self.shared_steps / self.steps if self.steps else 0.0
 
 
 class ResidentState(StrEnum):

@@ -11,6 +11,8 @@ from embomatrix.skills.trace import Step
 
 def contradiction(completed: Completed, rollout: Rollout, settings: RewardSettings) -> str:
     """Return the reason why no execution of the plan can have this result; empty if one can."""
+    if completed.shared_steps > len(completed.steps):
+        return f"it shares {completed.shared_steps} of its {len(completed.steps)} steps"
     return _wrong_steps(completed.steps, rollout) or _wrong_reward(
         completed.reward, completed.steps, settings
     )

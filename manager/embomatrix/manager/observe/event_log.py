@@ -111,9 +111,7 @@ class RunEventLog:
         return run
 
     def submitted(self, batch: Batch, *, now_s: float) -> None:
-        self._note(
-            EventKind.SUBMITTED, batch.run_id, now_s=now_s, batch_id=batch.batch_id, size=len(batch.rollouts)
-        )
+        self._note(EventKind.SUBMITTED, batch.run_id, now_s=now_s, batch_id=batch.batch_id, size=batch.count)
 
     def leased(self, command: GiveLease, *, now_s: float) -> None:
         origin = command.origin

@@ -229,7 +229,7 @@ class ResultDelivery:
     def _show(self, page: _Page) -> None:
         now_s = time.monotonic()
         for result, _ in page.results:
-            page.log.ends.take(result.cursor, result.group_id, type(result.outcome))
+            page.log.ends.take(result.cursor, result.group_id, type(result.outcome), result.count)
         page.log.append(
             [
                 timed_row(row, now_s - arrived_s) if isinstance(result.outcome, Completed) else row

@@ -127,9 +127,9 @@ class Runs:
                     run.run_id, row.batch_id, log.last_cursor, PAGE
                 ):
                     for result in page:
-                        group_id, kind = group_and_kind(result)
-                        log.ends.take(result.cursor, group_id, kind)
-                        failed += kind is InfraFailure
+                        group_id, kind, count = group_and_kind(result)
+                        log.ends.take(result.cursor, group_id, kind, count)
+                        failed += count if kind is InfraFailure else 0
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}
@@ -267,12 +267,12 @@ class Runs:
         return self._runs[run_id]
 
     def _check_batch(self, batch: Batch) -> None:
-        count = len(batch.rollouts)
+        count = batch.count
         if not 0 < count <= BATCH_ROLLOUTS:
             raise InvalidRequestError(
                 f"batch {batch.batch_id!r} has {count} rollouts: expected 1 to {BATCH_ROLLOUTS}"
             )
-        if len({rollout.rollout_id for rollout in batch.rollouts}) < count:
+        if len({name for rollout in batch.rollouts for name in (rollout.rollout_id, *rollout.also)}) < count:
             raise InvalidRequestError(
                 f"batch {batch.batch_id!r} has a rollout id twice: every id must be unique"
             )

@@ -66,11 +66,12 @@ def result_row(result: RolloutResult) -> ResultRow:
     return ResultRow(result.cursor, result.rollout_id, rollout_result_to_proto(result).SerializeToString())
 
 
-def group_and_kind(row: ResultRow) -> tuple[str, type[Outcome]]:
-    """Return the group and the kind of outcome of a result. Raises StateError."""
+def group_and_kind(row: ResultRow) -> tuple[str, type[Outcome], int]:
+    """Return the group, the kind of outcome, and the number of rollouts of a result. Raises StateError."""
     with readable(f"the result of rollout {row.rollout_id!r}"):
         message = types_pb2.RolloutResult.FromString(row.payload)
-        return message.group_id, _KINDS[message.WhichOneof("outcome") or "cancelled"]
+        kind = _KINDS[message.WhichOneof("outcome") or "cancelled"]
+        return message.group_id, kind, 1 + len(message.also)
 
 
 def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:

@@ -581,6 +581,8 @@ class RunStats(google.protobuf.message.Message):
     AUDITED_FIELD_NUMBER: builtins.int
     AUDIT_MISMATCHES_FIELD_NUMBER: builtins.int
     GROUPS_FAILED_FIELD_NUMBER: builtins.int
+    STEPS_FIELD_NUMBER: builtins.int
+    SHARED_STEPS_FIELD_NUMBER: builtins.int
     delivered: builtins.int
     infra_failures: builtins.int
     redispatched: builtins.int
@@ -594,6 +596,10 @@ class RunStats(google.protobuf.message.Message):
     audited: builtins.int
     audit_mismatches: builtins.int
     groups_failed: builtins.int
+    steps: builtins.int
+    """Steps of all completed rollouts."""
+    shared_steps: builtins.int
+    """Steps among them that were known from equal plans or equal beginnings and not executed."""
     def __init__(
         self,
         *,
@@ -610,7 +616,9 @@ class RunStats(google.protobuf.message.Message):
         audited: builtins.int = ...,
         audit_mismatches: builtins.int = ...,
         groups_failed: builtins.int = ...,
+        steps: builtins.int = ...,
+        shared_steps: builtins.int = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["audit_mismatches", b"audit_mismatches", "audited", b"audited", "cold_starts", b"cold_starts", "delivered", b"delivered", "groups_failed", b"groups_failed", "hedged", b"hedged", "infra_failures", b"infra_failures", "prewarm_hits", b"prewarm_hits", "prewarm_misses", b"prewarm_misses", "prewarm_wasted", b"prewarm_wasted", "redispatched", b"redispatched", "stale_results", b"stale_results", "warm_starts", b"warm_starts"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["audit_mismatches", b"audit_mismatches", "audited", b"audited", "cold_starts", b"cold_starts", "delivered", b"delivered", "groups_failed", b"groups_failed", "hedged", b"hedged", "infra_failures", b"infra_failures", "prewarm_hits", b"prewarm_hits", "prewarm_misses", b"prewarm_misses", "prewarm_wasted", b"prewarm_wasted", "redispatched", b"redispatched", "shared_steps", b"shared_steps", "stale_results", b"stale_results", "steps", b"steps", "warm_starts", b"warm_starts"]) -> None: ...
 
 Global___RunStats: typing_extensions.TypeAlias = RunStats

@@ -189,6 +189,7 @@ class Rollout(google.protobuf.message.Message):
     PLAN_FIELD_NUMBER: builtins.int
     SEED_FIELD_NUMBER: builtins.int
     RENDER_FIELD_NUMBER: builtins.int
+    ALSO_FIELD_NUMBER: builtins.int
     rollout_id: builtins.str
     group_id: builtins.str
     bundle_digest: builtins.str
@@ -198,6 +199,10 @@ class Rollout(google.protobuf.message.Message):
     """Needs a slot that renders on a GPU."""
     @property
     def plan(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SkillCall]: ...
+    @property
+    def also(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """Ids of further rollouts of the group that are equal in everything else. They are executed once and have equal outcomes."""
+
     def __init__(
         self,
         *,
@@ -208,8 +213,9 @@ class Rollout(google.protobuf.message.Message):
         plan: collections.abc.Iterable[Global___SkillCall] | None = ...,
         seed: builtins.int = ...,
         render: builtins.bool = ...,
+        also: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "task_id", b"task_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["also", b"also", "bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "task_id", b"task_id"]) -> None: ...
 
 Global___Rollout: typing_extensions.TypeAlias = Rollout
 
@@ -334,9 +340,12 @@ class Completed(google.protobuf.message.Message):
     WORKER_ID_FIELD_NUMBER: builtins.int
     TIMINGS_FIELD_NUMBER: builtins.int
     WARM_FIELD_NUMBER: builtins.int
+    SHARED_STEPS_FIELD_NUMBER: builtins.int
     trace_digest: builtins.str
     worker_id: builtins.str
     warm: builtins.bool
+    shared_steps: builtins.int
+    """Steps that were known from earlier rollouts and not executed."""
     @property
     def reward(self) -> Global___Reward: ...
     @property
@@ -355,9 +364,10 @@ class Completed(google.protobuf.message.Message):
         worker_id: builtins.str = ...,
         timings: Global___Timings | None = ...,
         warm: builtins.bool = ...,
+        shared_steps: builtins.int = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["reward", b"reward", "timings", b"timings"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["final_state", b"final_state", "reward", b"reward", "steps", b"steps", "timings", b"timings", "trace_digest", b"trace_digest", "warm", b"warm", "worker_id", b"worker_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["final_state", b"final_state", "reward", b"reward", "shared_steps", b"shared_steps", "steps", b"steps", "timings", b"timings", "trace_digest", b"trace_digest", "warm", b"warm", "worker_id", b"worker_id"]) -> None: ...
 
 Global___Completed: typing_extensions.TypeAlias = Completed
 
@@ -448,6 +458,7 @@ class RolloutResult(google.protobuf.message.Message):
     COMPLETED_FIELD_NUMBER: builtins.int
     INFRA_FAILURE_FIELD_NUMBER: builtins.int
     CANCELLED_FIELD_NUMBER: builtins.int
+    ALSO_FIELD_NUMBER: builtins.int
     rollout_id: builtins.str
     group_id: builtins.str
     cursor: builtins.int
@@ -458,6 +469,10 @@ class RolloutResult(google.protobuf.message.Message):
     def infra_failure(self) -> Global___InfraFailure: ...
     @property
     def cancelled(self) -> Global___Cancelled: ...
+    @property
+    def also(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """Ids of the rollouts that were submitted as equal to this one. They have the same outcome."""
+
     def __init__(
         self,
         *,
@@ -468,9 +483,10 @@ class RolloutResult(google.protobuf.message.Message):
         completed: Global___Completed | None = ...,
         infra_failure: Global___InfraFailure | None = ...,
         cancelled: Global___Cancelled | None = ...,
+        also: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["cancelled", b"cancelled", "completed", b"completed", "infra_failure", b"infra_failure", "outcome", b"outcome"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["attempt", b"attempt", "cancelled", b"cancelled", "completed", b"completed", "cursor", b"cursor", "group_id", b"group_id", "infra_failure", b"infra_failure", "outcome", b"outcome", "rollout_id", b"rollout_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["also", b"also", "attempt", b"attempt", "cancelled", b"cancelled", "completed", b"completed", "cursor", b"cursor", "group_id", b"group_id", "infra_failure", b"infra_failure", "outcome", b"outcome", "rollout_id", b"rollout_id"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["outcome", b"outcome"]) -> typing.Literal["completed", "infra_failure", "cancelled"] | None: ...
 
 Global___RolloutResult: typing_extensions.TypeAlias = RolloutResult

@@ -98,8 +98,9 @@ class PhysicsScene:
                 f"it has {len(self._tasks)}; submit the digest of the task's own bundle"
             )
         if self._tree is not None:
-            trace, judgement, _ = self._tree.execute(task, rollout.plan, rollout.seed, on_step)
+            trace, judgement, shared = self._tree.execute(task, rollout.plan, rollout.seed, on_step)
         else:
+            shared = 0
             trace = self._simulator.execute(task, rollout.plan, rollout.seed, on_step)
             judgement = judge(task, self._simulator.facts)
         return Completed(
@@ -110,6 +111,7 @@ class PhysicsScene:
             worker_id="",
             timings=Timings(),
             warm=True,
+            shared_steps=shared,
         )
 
 

@@ -75,9 +75,9 @@ class OpenBatches:
             group = opened.groups.get(rollout.group_id)
             if group is None:
                 group = opened.groups[rollout.group_id] = GroupRecord()
-            group.size += 1
-            group.coming += rollout.rollout_id not in delivered
-        opened.whole.size = len(batch.rollouts)
+            group.size += rollout.count
+            group.coming += rollout.count * (rollout.rollout_id not in delivered)
+        opened.whole.size = batch.count
         opened.whole.coming = sum(group.coming for group in opened.groups.values())
         opened.rest = _records(batch, delivered, self._sequence, now_s, warm, reward)
         self._sequence += len(batch.rollouts)
@@ -91,7 +91,8 @@ class OpenBatches:
         for record in records:
             for group in (batch.whole, batch.groups[record.rollout.group_id]):
                 group.open[record.key.rollout_id] = record
-                group.coming -= 1
+                group.waiting += record.count
+                group.coming -= record.count
         return records
 
     def conclude(self, record: RolloutRecord) -> int:
@@ -100,6 +101,7 @@ class OpenBatches:
         batch = self.of(record)
         for group in (batch.whole, batch.groups[record.rollout.group_id]):
             del group.open[record.key.rollout_id]
+            group.waiting -= record.count
             if group.in_tail:
                 self.tails[group] = None
             else:
@@ -158,7 +160,10 @@ def failed_with(
 
 def group_sizes(batch: Batch) -> dict[str, int]:
     """Return the number of rollouts of each group."""
-    return dict(Counter(rollout.group_id for rollout in batch.rollouts))
+    sizes: Counter[str] = Counter()
+    for rollout in batch.rollouts:
+        sizes[rollout.group_id] += rollout.count
+    return dict(sizes)
 
 
 class GroupEnds:
@@ -174,10 +179,10 @@ class GroupEnds:
         self._ended: dict[int, GroupDone] = {}
         """Ended groups, by the cursor of their last result."""
 
-    def take(self, cursor: int, group_id: str, outcome: type[Outcome]) -> None:
-        """Count the next result in cursor order."""
+    def take(self, cursor: int, group_id: str, outcome: type[Outcome], count: int = 1) -> None:
+        """Count the next result in cursor order, which ``count`` rollouts have."""
         counts = self._counts[group_id]
-        counts[outcome] += 1
+        counts[outcome] += count
         if counts.total() == self._sizes.get(group_id):
             del self._counts[group_id]
             self._ended[cursor] = GroupDone(

@@ -98,8 +98,8 @@ def _complete(state: DispatchState, lease: LeaseRecord, completed: Completed) ->
     warm = record.warm and completed.warm
     result = completed.noted(timings=timings, warm=warm, worker_id=lease.worker_id)
     if not record.check:
-        run.counters.warm_starts += record.warm
-        run.counters.cold_starts += not record.warm
+        run.counters.warm_starts += record.count * record.warm
+        run.counters.cold_starts += record.count * (not record.warm)
         if hold_for_audit(state, lease, result):
             return
     finish(state, record, result)

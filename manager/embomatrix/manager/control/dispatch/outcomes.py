@@ -15,7 +15,7 @@ from embomatrix.manager.control.dispatch.records import (
 )
 from embomatrix.manager.control.dispatch.state import AuditCase, DispatchState
 from embomatrix.rpc.wire.run_log import RolloutStepKind
-from embomatrix.rpc.wire.values import Batch, Cancelled, InfraFailure, Outcome, RolloutResult
+from embomatrix.rpc.wire.values import Batch, Cancelled, Completed, InfraFailure, Outcome, RolloutResult
 
 CANCELLED = Cancelled("the trainer called it off")
 
@@ -35,7 +35,7 @@ def open_batch(state: DispatchState, batch: Batch, delivered: Mapping[str, int])
     state.log(
         RolloutStepKind.SUBMITTED,
         RolloutKey(*key, ""),
-        reason=f"in a batch of {len(batch.rollouts)} rollouts",
+        reason=f"in a batch of {batch.count} rollouts",
     )
     run.submitted += opened.whole.left
     if not opened.whole.left:
@@ -119,11 +119,19 @@ def _conclude(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> 
     batch = state.batches.of(record)
     cursor = state.batches.conclude(record)
     counters = state.runs.of(record.key.run_id).counters
-    counters.delivered += 1
-    counters.infra_failures += isinstance(outcome, InfraFailure)
+    count, also = record.count, record.rollout.also
+    counters.delivered += count
+    counters.infra_failures += count * isinstance(outcome, InfraFailure)
+    if isinstance(outcome, Completed):
+        steps = len(outcome.steps)
+        counters.steps += count * steps
+        counters.shared_steps += (count - 1) * steps + outcome.shared_steps
     state.log(RolloutStepKind.DELIVERED, record.key, reason=type(outcome).__name__)
+    for name in also:
+        key = record.key._replace(rollout_id=name)
+        state.log(RolloutStepKind.DELIVERED, key, reason=f"with {record.key.rollout_id}, whose plan is equal")
     result = RolloutResult(
-        record.key.rollout_id, record.rollout.group_id, cursor, max(record.attempts, 1), outcome
+        record.key.rollout_id, record.rollout.group_id, cursor, max(record.attempts, 1), outcome, also
     )
     state.emit(DeliverResult(batch.run_id, batch.batch_id, result))
     if not batch.whole.left:

@@ -43,7 +43,7 @@ class DispatchPhase(Enum):
 
 @dataclass(slots=True, eq=False)
 class RolloutRecord:
-    """A rollout, or a check: a further execution of a rollout, made to compare results."""
+    """A rollout with those that are equal to it, or a check: a further execution of a rollout, made to compare results."""
 
     key: RolloutKey
     rollout: Rollout
@@ -79,6 +79,11 @@ class RolloutRecord:
     @property
     def scene(self) -> str:
         return self.rollout.bundle_digest
+
+    @property
+    def count(self) -> int:
+        """Number of rollouts that this record stands for."""
+        return self.rollout.count
 
 
 @dataclass(slots=True, eq=False)
@@ -124,14 +129,18 @@ class GroupRecord:
     coming: int = 0
     """Rollouts of a large batch that have no record yet."""
     open: dict[str, RolloutRecord] = field(default_factory=dict)
-    """Rollouts without an outcome, by id."""
+    """Records of rollouts without an outcome, by id."""
+    waiting: int = 0
+    """Number of rollouts that ``open`` stands for."""
     failed: bool = False
     """An infrastructure failure took a member."""
+    worker_id: str = ""
+    """Worker of the last lease of a member."""
 
     @property
     def left(self) -> int:
         """Number of rollouts without an outcome."""
-        return len(self.open) + self.coming
+        return self.waiting + self.coming
 
     @property
     def in_tail(self) -> bool:
@@ -177,6 +186,8 @@ class RunCounters:
     groups_failed: int = 0
     audited: int = 0
     audit_mismatches: int = 0
+    steps: int = 0
+    shared_steps: int = 0
 
     def stats(self) -> RunStats:
         return RunStats(**{name: getattr(self, name) for name in self.__slots__})

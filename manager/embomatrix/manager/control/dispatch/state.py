@@ -10,7 +10,13 @@ from embomatrix.manager.control.dispatch.batches import OpenBatches
 from embomatrix.manager.control.dispatch.fair_share import RunAccounts
 from embomatrix.manager.control.dispatch.leases import LeaseTable
 from embomatrix.manager.control.dispatch.queues import PendingQueues
-from embomatrix.manager.control.dispatch.records import DispatchPhase, LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.control.dispatch.records import (
+    BatchRecord,
+    DispatchPhase,
+    LeaseRecord,
+    RolloutKey,
+    RolloutRecord,
+)
 from embomatrix.manager.control.events import Event
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Opinion
 from embomatrix.manager.control.workers import WorkerPool
@@ -246,12 +252,12 @@ class DispatchState:
 
     def batches_with(self, rollout_id: str) -> set[tuple[str, str]]:
         """Return run and batch id of the open batches that have this rollout without an outcome."""
-        return {(b.run_id, b.batch_id) for b in self.batches if rollout_id in b.open}
+        return {(b.run_id, b.batch_id) for b in self.batches if self._open_record(b, rollout_id)}
 
     def where(self, rollout_id: str) -> str:
         """Return the place of a rollout without an outcome, in words; empty if there is none."""
         for batch in self.batches:
-            record = batch.open.get(rollout_id)
+            record = self._open_record(batch, rollout_id)
             if record is None:
                 continue
             if record.leases:
@@ -264,6 +270,14 @@ class DispatchState:
             return f"queued; {self.queues.count(record.scene)} rollouts wait for scene {record.scene}"
         return ""
 
+    @staticmethod
+    def _open_record(batch: BatchRecord, rollout_id: str) -> RolloutRecord | None:
+        """Return the record that stands for a rollout without an outcome."""
+        record = batch.open.get(rollout_id)
+        if record is None:
+            record = next((r for r in batch.open.values() if rollout_id in r.rollout.also), None)
+        return record
+
     def check_invariants(self) -> None:
         """Raise AssertionError if parts of the state contradict each other. Costs a scan of the whole state."""
         self.pool.check_invariants()
@@ -272,6 +286,8 @@ class DispatchState:
         queued = set(self.queues)
         for batch in self.batches:
             assert batch.whole.left, (batch.run_id, batch.batch_id)
+            for group in (batch.whole, *batch.groups.values()):
+                assert group.waiting == sum(record.count for record in group.open.values())
             for record in batch.open.values():
                 places = [
                     record in queued,
