@@ -61,7 +61,7 @@ class FakeCluster(
             self.submissions += 1
             batch = batch_from_proto(request)
             self.results = [
-                RolloutResult(rollout.rollout_id, rollout.group_id, cursor, 1, Cancelled())
+                RolloutResult(rollout.rollout_id, rollout.group_id, cursor, 1, Cancelled(), rollout.also)
                 for cursor, rollout in enumerate(batch.rollouts, start=1)
             ]
             async for response in self._stream(0, rollout_service_pb2.ExecuteResponse, context):

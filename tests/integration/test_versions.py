@@ -67,7 +67,7 @@ async def test_trainer_of_an_unknown_version_is_refused(tmp_path):
             pytest.raises(PreconditionError, match=r"upgrade this manager with `pip install --upgrade"),
             cluster_errors(at.address),
         ):
-            await stub.OpenRun(rollout_service_pb2.OpenRunRequest(protocol_version=3), timeout=5)
+            await stub.OpenRun(rollout_service_pb2.OpenRunRequest(protocol_version=4), timeout=5)
 
 
 @pytest.mark.parametrize(

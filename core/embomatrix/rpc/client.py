@@ -33,7 +33,7 @@ from embomatrix.rpc.status import (
     cluster_error,
     cluster_errors,
 )
-from embomatrix.rpc.versions import SPOKEN, agree, capabilities_of
+from embomatrix.rpc.versions import MERGING_VERSION, SPOKEN, agree, capabilities_of
 from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
 from embomatrix.rpc.wire.rollout import batch_to_proto, merged
@@ -94,10 +94,12 @@ class ClusterClient(AdminClient):
         limits: ClientLimits = DEFAULT_LIMITS,
         merging: bool = True,
     ) -> None:
-        """With ``merging``, equal rollouts of a group are sent and executed once."""
+        """With ``merging``, equal rollouts of a group are executed once, if the manager of the opened run can do that."""
         super().__init__(address, token, ca=ca, call_s=limits.call_s, failover_s=limits.failover_s)
         self._limits = limits
         self._merging = merging
+        self._merges = False
+        """True once the manager is known to accept merged rollouts."""
 
     @property
     def _rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
@@ -120,6 +122,7 @@ class ClusterClient(AdminClient):
             them=f"the manager at {self._address}",
             their_release=found.release,
         )
+        self._merges = self._merging and request.protocol_version >= MERGING_VERSION
         answer = await self._rollouts.OpenRun(request, timeout=self._call_s)
         return str(answer.run_id)
 
@@ -172,7 +175,7 @@ class ClusterClient(AdminClient):
         """
         within_s = self._limits.batch_s if deadline_s is None else deadline_s
         attached = _AttachedBatch(batch, within_s)
-        if self._merging:
+        if self._merges:
             attached.batch = dataclasses.replace(batch, rollouts=tuple(merged(batch.rollouts)))
         backoff = Backoff(self._limits.retry_first_s, self._limits.retry_longest_s)
         while attached.missing:

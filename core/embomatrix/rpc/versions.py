@@ -16,7 +16,11 @@ from embomatrix.rpc.status import PreconditionError
 if TYPE_CHECKING:
     from embomatrix.proto.v1.rollout_service_pb2_grpc import RolloutServiceAsyncStub
 
-PROTOCOL_VERSION: Final = 2
+PROTOCOL_VERSION: Final = 3
+"""Newest version."""
+OLDEST_VERSION: Final = 2
+MERGING_VERSION: Final = 3
+"""First version in which a rollout can name the ids of equal ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +36,7 @@ class VersionRange:
 
 _EXTRAS: Final = ("manager", "worker", "trainer")
 
-SPOKEN: Final = VersionRange(PROTOCOL_VERSION, PROTOCOL_VERSION)
+SPOKEN: Final = VersionRange(OLDEST_VERSION, PROTOCOL_VERSION)
 
 
 def agree(ours: VersionRange, theirs: VersionRange, *, us: str, them: str, their_release: str = "") -> int:

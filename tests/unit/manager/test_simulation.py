@@ -67,6 +67,7 @@ trainers = st.builds(
     steps=st.integers(1, 3),
     groups=st.integers(1, 6),
     group_size=st.sampled_from([1, 4, 16]),
+    distinct=st.sampled_from([0, 1, 3]),
     lookahead=st.integers(0, 4),
     write_s=st.sampled_from([0.0, 1.0]),
     update_s=st.sampled_from([0.0, 1.0]),

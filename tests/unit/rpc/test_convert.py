@@ -14,6 +14,7 @@ from embomatrix.rpc.wire import outcome as convert_outcome
 from embomatrix.rpc.wire import rollout as convert
 from embomatrix.rpc.wire import run as convert_run
 from embomatrix.rpc.wire import session as convert_session
+from embomatrix.rpc.wire.bounds import MOST_EQUAL
 from embomatrix.rpc.wire.codec import ConvertError
 from embomatrix.rpc.wire.values import (
     Batch,
@@ -387,3 +388,35 @@ def test_large_calls_and_steps_stay_in_no_cache():
     finally:
         tracemalloc.stop()
     assert kept_bytes < 1e6
+
+
+@given(st.lists(st.tuples(st.sampled_from("gh"), st.integers(0, 2), st.integers(0, 1)), max_size=150))
+def test_merged_rollouts_stand_for_all_rollouts(drawn):
+    rollouts = [
+        Rollout(f"{number}", group, "d", "t", (SkillCall(Skill.MOVE, object_index=index),), seed)
+        for number, (group, index, seed) in enumerate(drawn)
+    ]
+    whole = convert.merged(rollouts)
+    again = [
+        dataclasses.replace(one, rollout_id=name, also=())
+        for one in whole
+        for name in (one.rollout_id, *one.also)
+    ]
+    assert sorted(again, key=lambda one: int(one.rollout_id)) == rollouts
+    assert all(len(one.also) <= MOST_EQUAL for one in whole)
+    assert len(whole) <= len(set(drawn)) + len(drawn) // (MOST_EQUAL + 1)
+    batch = Batch("r", "b", 1, tuple(whole))
+    assert convert.batch_from_proto(convert.batch_to_proto(batch)) == batch
+
+
+def test_merged_rollouts_with_long_ids_fit_in_a_message():
+    names = [f"{number:0256}" for number in range(20)]
+    whole = convert.merged([Rollout(name, "g", "d", "t", (), 0) for name in names])
+    assert [name for one in whole for name in (one.rollout_id, *one.also)] == names
+    assert all(convert.rollout_from_proto(convert.rollout_to_proto(one)) == one for one in whole)
+
+
+def test_id_that_occurs_twice_among_equal_rollouts_is_refused():
+    batch = Batch("r", "b", 1, (Rollout("x", "g", "d", "t", (), 0, also=("y", "x")),))
+    with pytest.raises(ConvertError, match="found 'x' a second time"):
+        convert.batch_from_proto(convert.batch_to_proto(batch))

@@ -81,7 +81,7 @@ class InvariantChecker:
 
     def submit(self, batch: Batch) -> None:
         key = batch.run_id, batch.batch_id
-        ids = {rollout.rollout_id for rollout in batch.rollouts}
+        ids = {name for rollout in batch.rollouts for name in (rollout.rollout_id, *rollout.also)}
         self._submitted[key] = ids
         self._open[key] = set(ids)
         self.submitted += len(ids)
@@ -163,13 +163,14 @@ class InvariantChecker:
 
     def _deliver(self, key: tuple[str, str], result: RolloutResult) -> None:
         rollout_id = result.rollout_id
-        _check(rollout_id in self._submitted.get(key, ()), f"{rollout_id} was never submitted")
-        _check(rollout_id in self._open.get(key, ()), f"{rollout_id} was delivered twice")
+        for name in (rollout_id, *result.also):
+            _check(name in self._submitted.get(key, ()), f"{name} was never submitted")
+            _check(name in self._open.get(key, ()), f"{name} was delivered twice")
         cursor = self._cursors.get(key, 0) + 1
         _check(result.cursor == cursor, f"{rollout_id} has cursor {result.cursor}: expected {cursor}")
-        self._open[key].remove(rollout_id)
+        self._open[key].difference_update((rollout_id, *result.also))
         self._cursors[key] = cursor
-        self.delivered += 1
+        self.delivered += result.count
         outcome = result.outcome
         if isinstance(outcome, Completed):
             evidence = (rollout_id, outcome.worker_id)
@@ -182,7 +183,7 @@ class InvariantChecker:
             )
         elif isinstance(outcome, InfraFailure):
             _check(not hasattr(outcome, "reward"), f"{rollout_id} failed and has a reward")
-            self.infra_failures += 1
+            self.infra_failures += result.count
             self._lost_in |= {(key[1], result.group_id), (key[1], "")}
         else:
             policy = self._policies.get(key[0], GroupPolicy.PARTIAL)

@@ -58,6 +58,8 @@ class Trainer:
     steps: int = 6
     groups: int = 32
     group_size: int = 16
+    distinct: int = 0
+    """Different plans in a group; 0: all are different."""
     lookahead: int = 2
     """Steps announced beside the present one."""
     write_s: float = 4.0

@@ -77,9 +77,11 @@ class SimulatedTrainer:
         plan, step = self.plan, self._step
         name = f"{plan.name}.{step}.{group}"
         scene = self._actual[step][group]
+        names = [f"{name}.{index}" for index in range(plan.group_size)]
+        count = plan.distinct or plan.group_size
         rollouts = tuple(
-            Rollout(f"{name}.{index}", name, scene, scene, (), step, plan.render)
-            for index in range(plan.group_size)
+            Rollout(first, name, scene, scene, (), step, plan.render, tuple(also))
+            for first, *also in (names[start::count] for start in range(min(count, plan.group_size)))
         )
         self._sent_s = self._queue.now_s
         self._open[name] = plan.group_size, self._sent_s
@@ -87,7 +89,8 @@ class SimulatedTrainer:
         batch = Batch(plan.name, name, step + 1, rollouts)
         self._queue.after(plan.latency_s, lambda: self._manager.submit(batch))
 
-    def _take(self, results: Sequence[RolloutResult]) -> None:
+    def _take(self, merged: Sequence[RolloutResult]) -> None:
+        results = [one for result in merged for one in result.each()]
         for result in results:
             left, sent_s = self._open[result.group_id]
             self._open[result.group_id] = left - 1, sent_s

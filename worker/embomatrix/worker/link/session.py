@@ -15,7 +15,7 @@ from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.status import ClusterError, DeadlineError, NotFoundError, UnavailableError, cluster_errors
-from embomatrix.rpc.versions import PROTOCOL_VERSION
+from embomatrix.rpc.versions import SPOKEN
 from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.leases import LeaseClaim, LeaseRef, WorkerState
 from embomatrix.rpc.wire.session import (
@@ -66,8 +66,8 @@ async def register(membership: Membership, *, boot_id: str, resources: Resources
     request = pb.RegisterRequest(
         worker_id=membership.name,
         boot_id=boot_id,
-        protocol_version=PROTOCOL_VERSION,
-        protocol_low=PROTOCOL_VERSION,
+        protocol_version=SPOKEN.newest,
+        protocol_low=SPOKEN.oldest,
         resources=resources_to_proto(resources),
         join_token=membership.token if membership.joining else "",
     )
