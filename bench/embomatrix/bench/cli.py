@@ -139,6 +139,47 @@ def operations(
 
 
 @app.command()
+def traffic(
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="Traffic of your own run: a file of `embomatrix train --record`. [default: a shipped sample]"
+        ),
+    ] = None,
+    dataset: Annotated[Path | None, typer.Option(help="Dataset of that run.")] = None,
+    json_file: Json = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Replays of each phase.")] = 3,
+) -> None:
+    """Replay what a training run submitted, with and without shared calls, and through other libraries."""
+    from embomatrix.bench.traffic.recording import recorded_traffic, shipped_traffic
+    from embomatrix.bench.traffic.replay import TrafficSizes, bench_traffic
+
+    if (record is None) != (dataset is None):
+        raise typer.BadParameter("--record and --dataset belong together: expected both or none")
+    with refusals():
+        found = shipped_traffic() if record is None or dataset is None else recorded_traffic(record, dataset)
+        sizes = TrafficSizes(rounds=rounds)
+        hand_in(_measured("traffic", lambda on_step: bench_traffic(found, sizes, on_step)), json_file)
+
+
+@app.command()
+def sample(
+    record: Annotated[Path, typer.Option(help="File of `embomatrix train --record`.")],
+    dataset: Annotated[Path, typer.Option(help="Dataset of that run.")],
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes of the sample.")] = 18,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds and records give equal samples.")] = 0,
+) -> None:
+    """Write a sample of a training run's traffic, as the package ships one for `bench traffic`."""
+    from embomatrix.bench.traffic.recording import save_sample
+
+    with refusals():
+        found = save_sample(record, dataset, out, scenes, seed)
+    groups = f"{len(found.early)} early and {len(found.late)} late groups"
+    console.print(f"wrote {groups} in {len(found.bundles)} scenes to {out}", highlight=False)
+
+
+@app.command()
 def adversary(
     dataset: DataSet = PINNED,
     json_file: Json = None,

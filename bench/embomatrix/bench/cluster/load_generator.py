@@ -120,14 +120,14 @@ class LoadGenerator:
 
 @contextlib.asynccontextmanager
 async def load_generator(
-    cluster: BenchCluster, bundles: Mapping[str, bytes], limit_s: float
+    cluster: BenchCluster, bundles: Mapping[str, bytes], limit_s: float, *, merging: bool = True
 ) -> AsyncIterator[LoadGenerator]:
     """Open a run once all workers have joined and the manager holds the bundles.
 
     Raise BenchError if a process ends, or if ``limit_s`` seconds pass before the context is left.
     """
     try:
-        async with asyncio.timeout(limit_s), ClusterClient(cluster.address) as client:
+        async with asyncio.timeout(limit_s), ClusterClient(cluster.address, merging=merging) as client:
             await _all_joined(client, cluster)
             await client.put_bundles(bundles)
             yield LoadGenerator(client, await client.open_run("bench"))
