@@ -1,7 +1,7 @@
-"""Recorded traffic of a trainer: the batches that it submitted, one line of JSON each, for ``embomatrix bench traffic``."""
+"""Recorded traffic of a trainer: the groups that it submitted, one line of JSON each, for ``embomatrix bench traffic``."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -23,7 +23,7 @@ class SubmittedGroup(msgspec.Struct, frozen=True):
     ``members`` holds for each rollout the index of its plan.
     """
 
-    batch_id: str
+    group_id: str
     step: int
     at_s: float
     bundle_digest: str
@@ -33,14 +33,22 @@ class SubmittedGroup(msgspec.Struct, frozen=True):
     members: tuple[int, ...]
 
     @classmethod
-    def of(cls, batch: Batch, at_s: float) -> Self:
-        """Return the record of a batch, whose rollouts are of one task."""
-        first = batch.rollouts[0]
-        texts = [plan_to_lines(rollout.plan) for rollout in batch.rollouts]
+    def each(cls, batch: Batch, at_s: float) -> Iterator[Self]:
+        """Yield the record of each group of a batch."""
+        groups: dict[str, list[Rollout]] = {}
+        for rollout in batch.rollouts:
+            groups.setdefault(rollout.group_id, []).append(rollout)
+        for number, rollouts in enumerate(groups.values()):
+            yield cls._of(f"{batch.batch_id}/{number}", batch.step, rollouts, at_s)
+
+    @classmethod
+    def _of(cls, group_id: str, step: int, rollouts: Sequence[Rollout], at_s: float) -> Self:
+        first = rollouts[0]
+        texts = [plan_to_lines(rollout.plan) for rollout in rollouts]
         plans = {text: index for index, text in enumerate(dict.fromkeys(texts))}
         return cls(
-            batch.batch_id,
-            batch.step,
+            group_id,
+            step,
             round(at_s, 3),
             first.bundle_digest,
             first.task_id,
@@ -54,8 +62,8 @@ class SubmittedGroup(msgspec.Struct, frozen=True):
         try:
             plans = [parse_plan(text, Profile.HOUSEHOLD) for text in self.plans]
         except PlanError as error:
-            raise TrafficError(f"batch {self.batch_id!r} has a plan that can't be read: {error}") from error
-        group_id = f"{prefix}{self.batch_id}"
+            raise TrafficError(f"group {self.group_id!r} has a plan that can't be read: {error}") from error
+        group_id = f"{prefix}{self.group_id}"
         return tuple(
             Rollout(
                 f"{group_id}/{number}", group_id, self.bundle_digest, self.task_id, plans[index], self.seed
@@ -72,8 +80,8 @@ class TrafficLog:
         self._began_s = time.monotonic()
 
     def append(self, batch: Batch) -> None:
-        group = SubmittedGroup.of(batch, time.monotonic() - self._began_s)
-        self._file.write(msgspec.json.encode(group) + b"\n")
+        for group in SubmittedGroup.each(batch, time.monotonic() - self._began_s):
+            self._file.write(msgspec.json.encode(group) + b"\n")
 
     def close(self) -> None:
         self._file.close()

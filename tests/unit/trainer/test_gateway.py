@@ -1,5 +1,6 @@
 """Gateway: executed and unparsable plans, lost rollouts, uploads, shutdown."""
 
+import contextlib
 import math
 import time
 
@@ -8,9 +9,10 @@ from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import DeadlineError, ManagerUnreachableError, UnavailableError
+from embomatrix.rpc.traffic import TrafficError, TrafficLog, read_traffic
 from embomatrix.rpc.wire.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
-from embomatrix.trainer.cluster.gateway import Gateway, result_of
+from embomatrix.trainer.cluster.gateway import Gateway, PlanGroup, result_of
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import evaluation_seed, training_seed
 
@@ -25,7 +27,12 @@ def gateway(cluster, **options):
 
 def outcomes(cluster, *texts, **options):
     with gateway(cluster, **options) as gate:
-        return result_of(gate.submit("b", 1, TASK, TASK.situation, texts, Codec.NAMES, 5))
+        return result_of(submit(gate, "b", texts))
+
+
+def submit(gate, batch_id, texts):
+    (future,) = gate.submit(batch_id, 1, [PlanGroup(TASK, TASK.situation, texts, 5)], Codec.NAMES)
+    return future
 
 
 def until(condition, seconds=10.0):
@@ -61,7 +68,7 @@ def test_reward_coefficients_apply_to_executed_and_unparsable_plans():
 
 
 def test_lost_rollout_has_no_reward():
-    lost, kept = outcomes(SymbolicCluster(TASKS, lost=frozenset({"b/0"})), ORACLE, ORACLE)
+    lost, kept = outcomes(SymbolicCluster(TASKS, lost=frozenset({"b/0/0"})), ORACLE, ORACLE)
     assert lost.reward is None
     assert math.isnan(lost.value)
     assert kept.success
@@ -71,9 +78,7 @@ def test_bundle_is_uploaded_once_before_its_first_rollout():
     cluster = SymbolicCluster(TASKS)
     with gateway(cluster) as gate:
         gate.announce({1: TASKS.train[:2], 2: TASKS.train[2:4]}, 8)
-        futures = [
-            gate.submit(f"b{at}", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES, 5) for at in range(3)
-        ]
+        futures = [submit(gate, f"b{at}", [ORACLE]) for at in range(3)]
         assert all(result_of(future)[0].success for future in futures)
         until(lambda: cluster.announced)
     assert cluster.sent == {task.bundle_digest for task in (*TASKS.train[:4], TASK)}
@@ -103,7 +108,7 @@ def test_exit_does_not_wait_for_an_unreachable_manager():
     cluster = Away(TASKS)
     cluster.refused = -1_000_000
     with gateway(cluster) as gate:
-        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES, 5)
+        submit(gate, "b", [ORACLE])
         until(lambda: cluster.refused > -1_000_000)
     assert cluster.closed
     assert cluster.sent == set()
@@ -112,7 +117,7 @@ def test_exit_does_not_wait_for_an_unreachable_manager():
 def test_exit_closes_the_run_with_pending_work():
     cluster = SymbolicCluster(TASKS, delay_s=60)
     with gateway(cluster) as gate:
-        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES, 5)
+        submit(gate, "b", [ORACLE])
     assert cluster.closed
 
 
@@ -133,3 +138,33 @@ def test_training_and_evaluation_use_different_seeds():
     assert all(0 <= seed < 2**31 for seed in evaluated)
     assert all(2**31 <= seed < 2**32 for seed in trained)
     assert training_seed(0, "a") == training_seed(0, "a", 0)
+
+
+def test_groups_of_one_batch_have_their_own_outcomes():
+    cluster = SymbolicCluster(TASKS, lost=frozenset({"b/1/"}))
+    tasks = TASKS.train[:3]
+    groups = [
+        PlanGroup(task, task.situation, [plan_in_names(task.oracle, task.situation), "no idea"], 5)
+        for task in tasks
+    ]
+    with gateway(cluster) as gate:
+        found = [result_of(future) for future in gate.submit("b", 1, groups, Codec.NAMES)]
+    assert cluster.batches == ["b"]
+    assert [outcomes[0].success for outcomes in found] == [True, False, True]
+    assert found[1][0].lost
+    assert all(outcomes[1].value == -1 for outcomes in found)
+
+
+def test_submitted_batches_can_be_recorded_and_read_back(tmp_path):
+    log = TrafficLog(tmp_path / "traffic.jsonl")
+    with contextlib.closing(log), gateway(SymbolicCluster(TASKS), on_submit=log.append) as gate:
+        result_of(submit(gate, "b", [ORACLE, ORACLE, "toggle_on countertop"]))
+        result_of(submit(gate, "c", ["no idea"]))
+    (group,) = read_traffic((tmp_path / "traffic.jsonl").read_bytes().splitlines())
+    assert (group.group_id, group.seed, group.members) == ("b/0", 5, (0, 0, 1))
+    assert [rollout.plan for rollout in group.rollouts()][:2] == [TASK.oracle, TASK.oracle]
+
+
+def test_damaged_record_names_its_line():
+    with pytest.raises(TrafficError, match="line 1 of the traffic"):
+        list(read_traffic([b'{"step": 1}']))

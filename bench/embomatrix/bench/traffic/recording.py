@@ -98,7 +98,7 @@ def save_sample(record: Path, dataset: Path, out: Path, scenes: int, seed: int) 
 def _grpo_groups(record: Path) -> list[SubmittedGroup]:
     try:
         with record.open("rb") as lines:
-            groups = [group for group in read_traffic(lines) if group.batch_id.startswith(GRPO_PREFIX)]
+            groups = [group for group in read_traffic(lines) if group.group_id.startswith(GRPO_PREFIX)]
     except (OSError, TrafficError) as error:
         raise BenchError(f"no traffic can be read from {record}: {error}") from error
     if not groups:

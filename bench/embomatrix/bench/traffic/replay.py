@@ -1,7 +1,7 @@
 """`bench traffic`: recorded traffic of GRPO, replayed through the whole cluster and through other libraries.
 
-Scenes are warm and transition trees are empty when the clock starts. Groups are submitted as the trainer does, each as a batch,
-and as soon as possible: what is measured is the most that the cores allow.
+Scenes are warm and transition trees are empty when the clock starts. Groups are submitted as the trainer does, eight
+in a batch, and as soon as possible: what is measured is the most that the cores allow.
 """
 
 from __future__ import annotations
@@ -50,8 +50,10 @@ class TrafficSizes:
     slots: int = 2
     rounds: int = 3
     """Replays of each phase, each with seeds of its own: no call is known from the round before."""
-    in_flight: int = 64
-    """Groups that are submitted before the first of them has its results."""
+    batch: int = 8
+    """Groups that are submitted together, as the trainer does."""
+    in_flight: int = 8
+    """Batches that are submitted before the first of them has its results."""
     start_s: float = 120.0
     """Limit for processes to start and load their scenes."""
     limit_s: float = 300.0
@@ -167,7 +169,7 @@ def _replay(
                 await load.warm_up([rollouts[0] for rollouts in rounds[0]])
                 await _touch_scenes(load, rounds[0])
                 before = CpuWatch(cluster)
-                walls_s = [await _submit(load, one, sizes.in_flight) for one in rounds]
+                walls_s = [await _submit(load, one, sizes) for one in rounds]
                 used = before.used()
                 count = sum(len(rollouts) for one in rounds for rollouts in one)
                 return PhaseReplay(count, tuple(walls_s), used, await load.close())
@@ -187,18 +189,18 @@ async def _touch_scenes(load: LoadGenerator, groups: Sequence[Sequence[Rollout]]
         )
 
 
-async def _submit(load: LoadGenerator, groups: Sequence[Sequence[Rollout]], in_flight: int) -> float:
-    """Submit every group as a batch and wait for all results. Return the wall time in seconds."""
-    places = asyncio.Semaphore(in_flight)
+async def _submit(load: LoadGenerator, groups: Sequence[Sequence[Rollout]], sizes: TrafficSizes) -> float:
+    """Submit all groups in batches and wait for all results. Return the wall time in seconds."""
+    places = asyncio.Semaphore(sizes.in_flight)
 
-    async def one(rollouts: Sequence[Rollout]) -> None:
+    async def one(batch: Sequence[Sequence[Rollout]]) -> None:
         async with places:
-            await load.submit(rollouts)
+            await load.submit([rollout for group in batch for rollout in group])
 
     started_s = time.perf_counter()
     async with asyncio.TaskGroup() as tasks:
-        for rollouts in groups:
-            tasks.create_task(one(rollouts))
+        for start in range(0, len(groups), sizes.batch):
+            tasks.create_task(one(groups[start : start + sizes.batch]))
     return time.perf_counter() - started_s
 
 

@@ -20,9 +20,9 @@ from embomatrix.bench.cluster.processes import output_of
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.bench.trainer.trl_steps import model_of, tokenizer_of
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for
+from embomatrix.skills.prompt import Codec, limited, prompt_for
 from embomatrix.skills.syntax import PROFILES, PlaceRelation
-from embomatrix.trainer.cluster.gateway import PlanOutcome
+from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome
 from embomatrix.trainer.config.settings import GrpoSettings
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.data.variation import Variation
@@ -74,20 +74,16 @@ class LengthScore:
     """Stand-in for the cluster: an immediate reward by the text's length, so that groups carry a signal."""
 
     def submit(
-        self,
-        batch_id: str,
-        step: int,
-        task: TrainingTask,
-        situation: Situation,
-        texts: Sequence[str],
-        codec: Codec,
-        seed: int,
-    ) -> Future[tuple[PlanOutcome, ...]]:
-        done: Future[tuple[PlanOutcome, ...]] = Future()
-        done.set_result(
-            tuple(PlanOutcome(text, RewardBreakdown(float(len(text)), 0.0, 0.0, (), False)) for text in texts)
-        )
-        return done
+        self, batch_id: str, step: int, groups: Sequence[PlanGroup], codec: Codec
+    ) -> list[Future[tuple[PlanOutcome, ...]]]:
+        return [_scored(group.texts) for group in groups]
+
+
+def _scored(texts: Sequence[str]) -> Future[tuple[PlanOutcome, ...]]:
+    done: Future[tuple[PlanOutcome, ...]] = Future()
+    rewards = (RewardBreakdown(float(len(text)), 0.0, 0.0, (), False) for text in texts)
+    done.set_result(tuple(map(PlanOutcome, texts, rewards)))
+    return done
 
 
 def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:

@@ -27,7 +27,7 @@ from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.trust import read_ca, read_token
 from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
+from embomatrix.trainer.cluster.gateway import Gateway, PlanGroup, PlanOutcome
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks, training_seed
 
@@ -121,31 +121,27 @@ class PlanScorer:
     def submit(
         self, task_ids: Sequence[str], texts: Sequence[str]
     ) -> list[tuple[list[int], Future[tuple[PlanOutcome, ...]]]]:
-        """Start the rollouts of these texts, one batch per task. Raises TrainerError for an unknown task.
+        """Start the rollouts of these texts as one batch with a group for each task. Raises TrainerError for an unknown task.
 
-        Return the indices of each batch's texts, and the future of their outcomes.
+        Return the indices of each group's texts, and the future of their outcomes.
         """
         opened = self.open()
         members: dict[str, list[int]] = {}
         for index, task_id in enumerate(task_ids):
             members.setdefault(task_id, []).append(index)
         tasks = {task_id: self._task(opened, task_id) for task_id in members}
-        pending = []
-        for task_id, indices in members.items():
-            number = next(self._numbers)
-            chosen = [texts[index] for index in indices]
-            task = tasks[task_id]
-            future = opened.gateway.submit(
-                f"score-{number}",
-                number,
+        groups = [
+            PlanGroup(
                 task,
                 task.situation,
-                chosen,
-                Codec.JSON,
+                [texts[index] for index in members[task_id]],
                 training_seed(self._seed, task_id),
             )
-            pending.append((indices, future))
-        return pending
+            for task_id, task in tasks.items()
+        ]
+        number = next(self._numbers)
+        futures = opened.gateway.submit(f"score-{number}", number, groups, Codec.JSON)
+        return list(zip(members.values(), futures, strict=True))
 
     async def score(self, task_ids: Sequence[str], texts: Sequence[str]) -> list[PlanOutcome]:
         """Score texts and keep their order. Can be awaited on any event loop. Raises TrainerError."""

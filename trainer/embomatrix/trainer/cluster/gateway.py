@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -31,6 +31,7 @@ from embomatrix.rpc.wire.values import (
     LookaheadEntry,
     Outcome,
     Rollout,
+    RolloutResult,
     RunStats,
     RunTerms,
 )
@@ -96,26 +97,80 @@ class PlanOutcome:
         return self.reward is not None and self.reward.success
 
 
+@dataclass(frozen=True, slots=True)
+class PlanGroup:
+    """Plans of one task, to be executed with one seed.
+
+    ``situation`` is the varied situation of the prompt, which resolves the object names in the texts.
+    """
+
+    task: TrainingTask
+    situation: Situation
+    texts: Sequence[str]
+    seed: int
+
+
 class PlanSubmitter(Protocol):
     """Part of the gateway that a GRPO step uses."""
 
     def submit(
-        self,
-        batch_id: str,
-        step: int,
-        task: TrainingTask,
-        situation: Situation,
-        texts: Sequence[str],
-        codec: Codec,
-        seed: int,
-    ) -> Future[tuple[PlanOutcome, ...]]:
-        """Execute one task's plans, all with this seed. Outcomes keep the order of ``texts``."""
+        self, batch_id: str, step: int, groups: Sequence[PlanGroup], codec: Codec
+    ) -> list[Future[tuple[PlanOutcome, ...]]]:
+        """Execute the plans of these groups. Return a future for each group; its outcomes keep the order of the texts."""
         ...
 
 
 def parse_policy_text(text: str, situation: Situation, codec: Codec) -> Plan:
     """Parse a policy's text. Raises PlanError if it holds no plan."""
     return parse_plan(with_indices(text, situation) if codec is Codec.NAMES else text, situation.profile)
+
+
+class _PendingGroup:
+    """Group whose outcomes are awaited."""
+
+    def __init__(self, group_id: str, group: PlanGroup, plans: Sequence[Plan | PlanOutcome]) -> None:
+        """``plans`` holds the outcome of each text that can't be parsed."""
+        self.group_id = group_id
+        self.future: Future[tuple[PlanOutcome, ...]] = Future()
+        self._group = group
+        self._plans = plans
+        self._outcomes: list[PlanOutcome | None] = [
+            plan if isinstance(plan, PlanOutcome) else None for plan in plans
+        ]
+
+    def rollouts(self) -> Iterator[Rollout]:
+        """Yield the rollouts of the texts that are plans."""
+        task = self._group.task
+        for index, plan in enumerate(self._plans):
+            if not isinstance(plan, PlanOutcome):
+                yield Rollout(
+                    rollout_id=f"{self.group_id}/{index}",
+                    group_id=self.group_id,
+                    bundle_digest=task.bundle_digest,
+                    task_id=task.task.task_id,
+                    plan=plan,
+                    seed=self._group.seed,
+                )
+
+    def take(self, result: RolloutResult) -> None:
+        index = int(result.rollout_id.rpartition("/")[2])
+        self._outcomes[index] = _plan_outcome(self._group.texts[index], result.outcome)
+        self.settle_if_complete()
+
+    def settle_if_complete(self) -> None:
+        """Hand over the outcomes once there are all."""
+        outcomes = tuple(one for one in self._outcomes if one is not None)
+        if len(outcomes) == len(self._outcomes) and not self.future.done():
+            self.future.set_result(outcomes)
+
+    def fail(self, error: BaseException) -> None:
+        """Hand over an error, unless the outcomes are there."""
+        if self.future.done():
+            return
+        if isinstance(error, asyncio.CancelledError):
+            self.future.cancel()
+        else:
+            self.future.set_exception(error)
 
 
 class Gateway:
@@ -259,53 +314,41 @@ class Gateway:
                     self._reports.popleft()
 
     def submit(
-        self,
-        batch_id: str,
-        step: int,
-        task: TrainingTask,
-        situation: Situation,
-        texts: Sequence[str],
-        codec: Codec,
-        seed: int,
-    ) -> Future[tuple[PlanOutcome, ...]]:
-        """Start the rollouts of one task's plans, all with this seed. Outcomes keep the order of ``texts``.
+        self, batch_id: str, step: int, groups: Sequence[PlanGroup], codec: Codec
+    ) -> list[Future[tuple[PlanOutcome, ...]]]:
+        """Start the rollouts of these groups as one batch. Return a future for each group.
 
-        ``situation`` is the varied situation of the prompt, which resolves the object names in the texts.
+        Its outcomes keep the order of the group's texts, and come as soon as the group is complete.
         """
-        plans: list[Plan | PlanOutcome] = [
-            _plan_or_failure(text, situation, codec, self._terms.reward) for text in texts
-        ]
-        rollouts = tuple(
-            Rollout(
-                rollout_id=f"{self.run_id}/{batch_id}/{index}",
-                group_id=f"{self.run_id}/{batch_id}",
-                bundle_digest=task.bundle_digest,
-                task_id=task.task.task_id,
-                plan=plan,
-                seed=seed,
+        pending = [
+            _PendingGroup(
+                f"{self.run_id}/{batch_id}/{row}",
+                group,
+                [_plan_or_failure(text, group.situation, codec, self._terms.reward) for text in group.texts],
             )
-            for index, plan in enumerate(plans)
-            if not isinstance(plan, PlanOutcome)
-        )
+            for row, group in enumerate(groups)
+        ]
+        rollouts = tuple(rollout for one in pending for rollout in one.rollouts())
         batch = Batch(self.run_id, batch_id, step, rollouts)
-        work = self._execute(batch, texts, plans)
-        return asyncio.run_coroutine_threadsafe(work, self._loop)
+        asyncio.run_coroutine_threadsafe(self._execute(batch, pending), self._loop)
+        return [one.future for one in pending]
 
-    async def _execute(
-        self, batch: Batch, texts: Sequence[str], plans: Sequence[Plan | PlanOutcome]
-    ) -> tuple[PlanOutcome, ...]:
-        outcomes: dict[str, Outcome] = {}
-        if batch.rollouts:
-            self._on_submit(batch)
-            await self._upload_once(batch.rollouts[0].bundle_digest)
-            async for result in self._cluster.execute(batch):
-                outcomes[result.rollout_id] = result.outcome
-        return tuple(
-            plan
-            if isinstance(plan, PlanOutcome)
-            else _plan_outcome(text, outcomes.get(f"{self.run_id}/{batch.batch_id}/{index}"))
-            for index, (text, plan) in enumerate(zip(texts, plans, strict=True))
-        )
+    async def _execute(self, batch: Batch, pending: Sequence[_PendingGroup]) -> None:
+        try:
+            groups = {one.group_id: one for one in pending}
+            for one in pending:
+                one.settle_if_complete()
+            if batch.rollouts:
+                self._on_submit(batch)
+                for digest in dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts):
+                    await self._upload_once(digest)
+                async for result in self._cluster.execute(batch):
+                    groups[result.group_id].take(result)
+        except BaseException as error:
+            for one in pending:
+                one.fail(error)
+            if not isinstance(error, ClusterError):
+                raise
 
 
 def _plan_or_failure(

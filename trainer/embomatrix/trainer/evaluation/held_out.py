@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome, result_of
+from embomatrix.trainer.cluster.gateway import Gateway, PlanGroup, PlanOutcome, result_of
 from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
 from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
 from embomatrix.trainer.policy.prompts import PromptBuilder
@@ -88,14 +88,16 @@ def evaluate_policy(
         prompts = [prompt_builder.plain(task) for task in chunk]
         tokens = [prompt.tokens for prompt in prompts]
         drawn = policy.sample(tokens, settings.samples, settings.temperature, max_new, generator)
-        for row, (task, prompt) in enumerate(zip(chunk, prompts, strict=True)):
-            texts = drawn.texts[row * settings.samples : (row + 1) * settings.samples]
-            batch_id = f"{label}-{number}-{row}"
-            execution_seed = evaluation_seed(seed, task.task.task_id)
-            future = gateway.submit(
-                batch_id, number, task, prompt.situation, texts, policy.codec, execution_seed
+        groups = [
+            PlanGroup(
+                task,
+                prompt.situation,
+                drawn.texts[row * settings.samples : (row + 1) * settings.samples],
+                evaluation_seed(seed, task.task.task_id),
             )
-            pending.append((task, future))
+            for row, (task, prompt) in enumerate(zip(chunk, prompts, strict=True))
+        ]
+        pending += zip(chunk, gateway.submit(f"{label}-{number}", number, groups, policy.codec), strict=True)
     scores = []
     for task, future in pending:
         outcomes: tuple[PlanOutcome, ...] = result_of(future)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter, result_of
+from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome, PlanSubmitter, result_of
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
@@ -115,18 +115,16 @@ class Sampler:
     ) -> SampledChunk:
         group = self._settings.group
         samples = learner.sample([prompt.tokens for _, prompt in prompts], seed)
-        futures = [
-            self._gateway.submit(
-                f"step-{step}-{index}-{row}",
-                step,
+        plans = [
+            PlanGroup(
                 task,
                 prompt.situation,
                 samples.texts[row * group : (row + 1) * group],
-                self._codec,
                 seed_of(step, task.task.task_id),
             )
             for row, (task, prompt) in enumerate(prompts)
         ]
+        futures = self._gateway.submit(f"step-{step}-{index}", step, plans, self._codec)
         tasks, task_prompts = zip(*prompts, strict=True)
         return SampledChunk(index, tasks, task_prompts, samples, futures, None)
 
