@@ -278,7 +278,7 @@ def make_tasks(train: int, heldout: int, *, seed: int = 0, objects: int = 16) ->
 class SymbolicCluster:
     """Cluster client over the symbolic rules.
 
-    Rollouts whose id contains an entry of ``lost`` are lost; ``lose_first`` loses one rollout of every batch.
+    Rollouts whose id contains an entry of ``lost`` are lost; ``lose_first`` loses one rollout of every group.
     """
 
     tasks: TaskSet
@@ -319,12 +319,12 @@ class SymbolicCluster:
         await asyncio.sleep(self.delay_s)
         for cursor, rollout in enumerate(batch.rollouts, start=1):
             assert rollout.bundle_digest in self.sent
-            yield RolloutResult(
-                rollout.rollout_id, rollout.group_id, cursor, 1, self._outcome(rollout, cursor)
-            )
+            yield RolloutResult(rollout.rollout_id, rollout.group_id, cursor, 1, self._outcome(rollout))
 
-    def _outcome(self, rollout, cursor):
-        if (self.lose_first and cursor == 1) or any(mark in rollout.rollout_id for mark in self.lost):
+    def _outcome(self, rollout):
+        if (self.lose_first and rollout.rollout_id.endswith("/0")) or any(
+            mark in rollout.rollout_id for mark in self.lost
+        ):
             return InfraFailure(InfraCode.WORKER_LOST, "the worker was lost")
         self.executed += 1
         reward, steps = run_plan(self._by_id[rollout.task_id], rollout.plan, self.terms.reward)

@@ -109,6 +109,11 @@ def _tiles(summary: RunSummary) -> str:
             f"{stats.prewarm_wasted:,} loads unused",
         ),
         (
+            "Shared steps",
+            _share(stats.shared_steps, stats.steps),
+            f"{stats.shared_steps:,} of {stats.steps:,} were not executed",
+        ),
+        (
             "Manager overhead",
             _share(summary.manager_cpu_s, cpu_s),
             "share of all CPU time, manager and slots",

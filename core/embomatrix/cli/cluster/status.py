@@ -158,11 +158,12 @@ def _runs(runs: Sequence[RunInfo]) -> list[str]:
         stats = run.stats
         started = stats.warm_starts + stats.cold_starts
         warm = f", {stats.warm_starts / started:.0%} of them in warm scenes" if started else ""
+        shared = f", {stats.shared_share:.0%} of their steps shared" if stats.shared_steps else ""
         failed = (
             f"; {stats.infra_failures} lost by the infrastructure" if stats.infra_failures else "; none lost"
         )
         again = f", {stats.redispatched} re-dispatched" if stats.redispatched else ""
-        done = f"{counted(stats.delivered, 'rollout')} done{warm}{failed}{again}"
+        done = f"{counted(stats.delivered, 'rollout')} done{warm}{shared}{failed}{again}"
         lines.append(f"Run {run.name or run.run_id}: {done}; {run.pending} under way.")
     more = len(runs) - NAMED
     return [*lines, f"{more} more runs are open."] if more > 0 else lines

@@ -75,7 +75,7 @@ def worker_table(workers: Sequence[WorkerInfo]) -> Table:
 
 
 def run_table(runs: Sequence[RunInfo]) -> Table:
-    figures = ("done", "open", "failed", "again", "late", "prewarm hits", "wasted")
+    figures = ("done", "open", "failed", "again", "late", "prewarm hits", "wasted", "shared")
     table = _table("run", "name", "state", **dict.fromkeys(figures, 1), **{"waits for": 0})
     for run in runs:
         stats = run.stats
@@ -88,6 +88,7 @@ def run_table(runs: Sequence[RunInfo]) -> Table:
             *map(str, counts),
             f"{stats.prewarm_hits}/{asked}" if asked else "-",
             str(stats.prewarm_wasted),
+            f"{stats.shared_share:.0%}" if stats.steps else "-",
             Text(printable(run.waits_for)),
         )
     return table

@@ -158,11 +158,11 @@ class RunEventLog:
             case Completed(timings=timings):
                 self.attempts[result.attempt] += 1
                 self.execute_s += timings.execute_s
-                run.figures.completed(timings, now_s)
+                run.figures.completed(timings, now_s, result.count)
                 return
             case InfraFailure(failure, message, worker_id):
                 self.attempts[result.attempt] += 1
-                run.figures.series.count(now_s, failed=1)
+                run.figures.series.count(now_s, failed=result.count)
                 code = failure.value
         event = self._note(
             EventKind.ENDED,

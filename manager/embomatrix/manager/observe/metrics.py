@@ -93,7 +93,10 @@ class FailureNote:
 
 
 class Meter:
-    """Counters of delivered results. Times are on the caller's monotonic clock."""
+    """Counters of delivered results. Times are on the caller's monotonic clock.
+
+    A result counts once for each of its equal rollouts; latencies are of executions.
+    """
 
     def __init__(self) -> None:
         self.outcomes: Counter[str] = Counter()
@@ -107,21 +110,21 @@ class Meter:
     def observe(self, run_id: str, result: RolloutResult, now_s: float) -> None:
         match result.outcome:
             case Completed(timings=timings, worker_id=worker_id):
-                self.outcomes["completed"] += 1
-                self.completed_by[worker_id] += 1
+                self.outcomes["completed"] += result.count
+                self.completed_by[worker_id] += result.count
                 if len(self.completed_by) > WORKERS_KEPT:
                     del self.completed_by[next(iter(self.completed_by))]
                 lease_s = timings.lease_s + timings.load_s + timings.execute_s
                 self._latency_s.append(timings.queued_s + lease_s)
-                self._per_second[int(now_s)] += 1
+                self._per_second[int(now_s)] += result.count
                 if len(self._per_second) > THROUGHPUT_S:
                     del self._per_second[next(iter(self._per_second))]
             case InfraFailure(code, message, worker_id):
-                self.outcomes[code.value] += 1
+                self.outcomes[code.value] += result.count
                 note = FailureNote(time.time(), code.value, message, worker_id, run_id, result.rollout_id)
                 self.failures.appendleft(note)
             case Cancelled():
-                self.outcomes["cancelled"] += 1
+                self.outcomes["cancelled"] += result.count
 
     def throughput(self, now_s: float) -> list[int]:
         """Return the completed rollouts of each of the last ``THROUGHPUT_S`` whole seconds, oldest first."""

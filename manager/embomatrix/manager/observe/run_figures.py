@@ -66,14 +66,14 @@ class RunFigures:
         self.workers: dict[str, WorkerFigures] = {}
         self.failures: deque[RunEvent] = deque(maxlen=FAILURES_KEPT)
 
-    def completed(self, timings: Timings, now_s: float) -> None:
-        """Count a result; its delivery is timed later."""
+    def completed(self, timings: Timings, now_s: float, count: int) -> None:
+        """Count the result of ``count`` equal rollouts; its delivery is timed later."""
         phases = self.phases
         phases[RolloutPhase.QUEUE].observe(timings.queued_s)
         phases[RolloutPhase.LEASE].observe(timings.lease_s)
         phases[RolloutPhase.LOAD].observe(timings.load_s)
         phases[RolloutPhase.EXECUTE].observe(timings.execute_s)
-        self.series.count(now_s, completed=1)
+        self.series.count(now_s, completed=count)
 
     def worker(self, worker_id: str) -> WorkerFigures:
         """Return the mutable figures of a worker."""

@@ -79,6 +79,10 @@ class _Cluster(Collector):
         won = event_log.hedges_won
         hedges = {"true": won, "false": max(0, totals.hedged - won)}
         yield _counter("embo_hedges", "Hedge leases, by whether they delivered first.", hedges, "won")
+        shared = {"shared": totals.shared_steps, "executed": totals.steps - totals.shared_steps}
+        yield _counter(
+            "embo_steps", "Steps of completed rollouts, by whether they were executed.", shared, "how"
+        )
         yield _counter("embo_groups_failed", "Failed groups.", totals.groups_failed)
 
     def _prewarming(self) -> Iterator[Metric]:

@@ -43,6 +43,8 @@ class StepRecord:
     rollouts: int
     lost: int
     warm: float
+    shared: float
+    """Share of the steps that were known from equal plans or equal beginnings and not executed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,13 @@ def record_of(
         rollouts=len(outcomes),
         lost=len(outcomes) - len(known),
         warm=_mean([outcome.warm for outcome in executed]),
+        shared=_mean([share for outcome in executed for share in _shared(outcome)]),
     )
+
+
+def _shared(outcome: Completed) -> list[bool]:
+    """Whether each step was shared."""
+    return [number < outcome.shared_steps for number in range(len(outcome.steps))]
 
 
 def _by_category(logs: Sequence[GroupLog]) -> dict[str, float]:

@@ -55,6 +55,7 @@ class LineDisplay:
             "success": f"{record.success:.0%}",
             "rollouts/s": f"{rollouts_per_s:.0f}",
             "warm starts": f"{record.warm:.0%}",
+            "shared steps": f"{record.shared:.0%}",
             "entropy": "–" if record.entropy is None else f"{record.entropy:.2f}",
             "zero-variance groups": f"{record.zero_variance_groups:.0%}",
         }

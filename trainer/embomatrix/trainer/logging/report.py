@@ -85,7 +85,8 @@ def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]],
         f"<h1>Training of {html.escape(outcome.model)}</h1>",
         f"<p>{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts; "
         f"{outcome.lost} rollouts lost to the infrastructure and masked; "
-        f"{prewarm_share(summary.stats):.0%} of announced scenes warm in time. Machine: {html.escape(machine)}.</p>",
+        f"{prewarm_share(summary.stats):.0%} of announced scenes warm in time, "
+        f"{summary.stats.shared_share:.0%} of the steps shared. Machine: {html.escape(machine)}.</p>",
         "<h2>Success on held-out tasks</h2>",
         html_table([("tasks", "before GRPO", "after", "difference"), *success_rows(summary)])
         if summary.after

@@ -40,7 +40,7 @@ export function show({overview: o, runs}) {
   at("bad").className = failed ? "bad" : "";
   const ago = o.throughput.map((_, i) => i - o.throughput.length + 1);
   drawn.draw(ago, [o.throughput.map((done, i) => -ago[i] > o.uptime_s ? null : done)]);
-  put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));
+  put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["shared", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));
   put(at("phases"), phases(o.phases));
   const rows = Object.entries(o.outcomes).sort((a, b) => b[1] - a[1]).map(([name, n]) => h("tr", {}, h("td", {}, h("code", {}, name)), h("td", {class: "n"}, count(n))));
   put(at("outcomes"), rows.length ? table(["outcome", ["rollouts", "n"]], rows, "outcomes") : none("No rollout has been executed yet."));
@@ -60,5 +60,6 @@ function run(r) {
     h("td", {class: "named", title: `${r.name} ${r.run_id}`}, h("a", {href: `#timeline?${encodeURIComponent(r.run_id)}`}, r.name || r.run_id)),
     h("td", {class: "n"}, count(r.stats.delivered)), h("td", {class: "n"}, count(r.pending)),
     h("td", {class: "n"}, share(r.stats.warm_starts, r.stats.warm_starts + r.stats.cold_starts)),
+    h("td", {class: "n", title: "steps that were known from equal plans or beginnings and not executed"}, share(r.stats.shared_steps, r.stats.steps)),
     h("td", {class: r.stats.infra_failures ? "n bad" : "n"}, count(r.stats.infra_failures)));
 }
