@@ -317,14 +317,17 @@ class SymbolicCluster:
     async def execute(self, batch):
         self.batches.append(batch.batch_id)
         await asyncio.sleep(self.delay_s)
+        groups = set()
         for cursor, rollout in enumerate(batch.rollouts, start=1):
             assert rollout.bundle_digest in self.sent
-            yield RolloutResult(rollout.rollout_id, rollout.group_id, cursor, 1, self._outcome(rollout))
+            first = rollout.group_id not in groups
+            groups.add(rollout.group_id)
+            yield RolloutResult(
+                rollout.rollout_id, rollout.group_id, cursor, 1, self._outcome(rollout, first=first)
+            )
 
-    def _outcome(self, rollout):
-        if (self.lose_first and rollout.rollout_id.endswith("/0")) or any(
-            mark in rollout.rollout_id for mark in self.lost
-        ):
+    def _outcome(self, rollout, *, first):
+        if (self.lose_first and first) or any(mark in rollout.rollout_id for mark in self.lost):
             return InfraFailure(InfraCode.WORKER_LOST, "the worker was lost")
         self.executed += 1
         reward, steps = run_plan(self._by_id[rollout.task_id], rollout.plan, self.terms.reward)
