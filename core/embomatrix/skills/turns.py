@@ -1,0 +1,96 @@
+"""Turns of a closed-loop episode: the prefix that a turn builds on, and the observation that it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from embomatrix.skills.describe import MAX_FINAL_LINES
+from embomatrix.skills.syntax import MAX_STEPS
+
+if TYPE_CHECKING:
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Step
+
+
+class PrefixMismatchError(Exception):
+    """Prefix that another execution does not reproduce: other failures, or another digest."""
+
+
+class EpisodeOverError(ValueError):
+    """More calls than one episode may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodePrefix:
+    """The first ``length`` calls of a plan, which the episode has made before, and what the client knows about them."""
+
+    length: int = 0
+    failed: tuple[int, ...] = ()
+    """Indices of the calls that failed, rising. The episode went on after them."""
+    digest: str = ""
+    """Digest of the trace after these calls; empty if unknown, which is not checked."""
+
+    def check(self, steps: Sequence[Step], digest: str) -> None:
+        """Raise PrefixMismatchError unless these steps of the prefix, and the digest after them, are the expected ones."""
+        for index, step in enumerate(steps):
+            if step.ok == (index in self.failed):
+                expected, found = ("to fail", "it succeeds") if step.ok else ("to succeed", "it fails")
+                reason = "" if step.failure is None else f" ({step.failure}: {step.message})"
+                raise PrefixMismatchError(
+                    f"call {index} of the prefix, {step.call.skill}: expected {expected} as recorded, found that {found}{reason}; "
+                    "begin the episode again"
+                )
+        if self.digest not in ("", digest):
+            raise PrefixMismatchError(
+                f"the digest after {self.length} calls of the prefix: expected {self.digest}, found {digest}; the platforms or "
+                "releases of two workers differ, or the calls do: begin the episode again"
+            )
+
+    def after(self, steps: Sequence[Step], digest: str) -> EpisodePrefix:
+        """Return the prefix that these further steps and the digest after them lead to."""
+        failed = (self.length + index for index, step in enumerate(steps) if not step.ok)
+        return replace(
+            self, length=self.length + len(steps), failed=(*self.failed, *failed), digest=digest
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class StateInWords:
+    """State in words of the objects in a task's table, one line each in its order."""
+
+    room: str
+    held: tuple[str, ...]
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TurnObservation:
+    """State that a turn leads to, in words. The outcome of each call is in the turn's steps."""
+
+    room: str
+    """Room of the robot; empty between rooms."""
+    held: tuple[str, ...]
+    """Object in the robot's hand, then its contents; empty for an empty hand."""
+    changes: tuple[str, ...]
+    """New lines of the table's objects that differ from the state before the turn, ``MAX_FINAL_LINES`` at most."""
+
+    @classmethod
+    def between(cls, before: StateInWords, after: StateInWords) -> TurnObservation:
+        """Return the observation of a turn that led from one state to another of the same task."""
+        changed = [new for old, new in zip(before.lines, after.lines, strict=True) if new != old]
+        left = len(changed) - MAX_FINAL_LINES
+        more = (f"and {left} more objects",) if left > 0 else ()
+        return cls(after.room, after.held, (*changed[:MAX_FINAL_LINES], *more))
+
+
+def check_length(prefix: Plan, calls: Plan) -> None:
+    """Raise EpisodeOverError unless an episode may go on with these calls."""
+    if not calls:
+        raise EpisodeOverError("a turn has no call: expected at least one skill call")
+    if len(prefix) + len(calls) > MAX_STEPS:
+        raise EpisodeOverError(
+            f"the episode has {len(prefix)} calls, and {len(calls)} more are too many: expected at most {MAX_STEPS} in all; "
+            "begin another episode"
+        )
