@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import sys
 from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -15,10 +14,10 @@ from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.live_world import LiveWorld, WorldMark
 from embomatrix.sim.state.sources import Change
 from embomatrix.skills.check import check
-from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained, line
+from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
 from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.skills.trace import Step, Trace
-from embomatrix.skills.turns import StateInWords, TurnObservation
+from embomatrix.skills.turns import TurnObservation
 from embomatrix.skills.view import SkillRefusal, source_of, target_of
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.state import State
@@ -262,15 +261,14 @@ class Simulator:
         for call in plan[:prefix]:
             steps.append(self.run_step(call))
             on_step(len(steps))
-        start, before = self.mark(), self.in_words(task)
+        start, before = self.mark(), self.world.mark()
         for call in plan[prefix:]:
             steps.append(self.run_step(call))
             on_step(len(steps))
             if not steps[-1].ok:
                 break
         end = self.mark()
-        observation = TurnObservation.between(before, self.in_words(task))
-        return TurnRun(tuple(steps), start.digest, end.digest, end.touched, observation)
+        return TurnRun(tuple(steps), start.digest, end.digest, end.touched, self.observe(task, before))
 
     def describe(self, task: Task) -> tuple[str, ...]:
         """State in words of the goal's objects and of those that a call succeeded on, in the table's order."""
@@ -282,12 +280,11 @@ class Simulator:
         """State in words of every object in the task's table, in its order; it reveals nothing about the goal."""
         return final_lines([self._description(name) for name in task.table])
 
-    def in_words(self, task: Task) -> StateInWords:
-        """State in words of the robot and of every object in the task's table."""
-        world = self.world
-        # Interned: most lines of two states are equal.
-        lines = tuple(sys.intern(line(self._description(name))) for name in task.table)
-        return StateInWords(world.robot_room, world.carried, lines)
+    def observe(self, task: Task, before: WorldMark) -> TurnObservation:
+        """Describe the present state and what has changed since another state of this task."""
+        changed = self.world.mark().changed_since(before)
+        descriptions = [self._description(name) for name in task.table if name in changed]
+        return TurnObservation(self.world.robot_room, self.world.carried, final_lines(descriptions))
 
     def warm_up(self) -> Iterator[None]:
         """Compute cached values ahead of their first use, a little per step. Changes no answer.

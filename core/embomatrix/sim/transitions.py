@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
 
 from embomatrix.sim.executor import TurnRun
-from embomatrix.skills.turns import TurnObservation
 
 if TYPE_CHECKING:
     from embomatrix.sim.executor import Mark, Simulator
+    from embomatrix.sim.live_world import WorldMark
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.trace import Step, Trace
-    from embomatrix.skills.turns import StateInWords
+    from embomatrix.skills.turns import TurnObservation
     from embomatrix.world.task import Task
 
 NODES_KEPT: Final = 4_000
@@ -40,8 +40,10 @@ class _Node(Generic[T]):
     """None for a start that was not asked for its mark."""
     ending: tuple[Trace, T] | None = None
     """Trace and judgement of a plan that ends here. Those of other plans differ in the plan alone."""
-    turn_end: tuple[StateInWords, T] | None = None
-    """State in words and judgement, if a turn has begun or ended here."""
+    world: WorldMark | None = None
+    """State of the world where the mark lacks it, if a turn has begun here."""
+    turn: tuple[int, TurnObservation, T] | None = None
+    """Prefix, observation and judgement of a turn that ended here."""
     children: dict[_Key, _Node[T]] = field(default_factory=dict)
 
 
@@ -87,16 +89,17 @@ class TransitionTree(Generic[T]):
 
         Equal to ``Simulator.execute_turn`` and a judgement of the final state.
         """
+        self._mark_of(self._start(task, seed), task, seed)  # while the simulator is there, if it must go there
         nodes, _ = self._walk(task, plan, seed, prefix, on_step)
-        end = nodes[-1]
-        # The end first: the simulator is there. The beginning is known, unless another slot has executed the turn before.
-        after, judgement = self._turn_end(end, task, seed)
-        before, _ = self._turn_end(nodes[prefix], task, seed)
-        prefix_digest = self._mark_of(nodes[prefix], task, seed).digest
-        last = self._mark_of(end, task, seed)
+        begin, end = nodes[prefix], nodes[-1]
+        if end.turn is None or end.turn[0] != prefix:
+            before = self._world_at(begin, task, seed)
+            self._go_to(end, task, seed)
+            end.turn = prefix, self._simulator.observe(task, before), self._judge(task)
+        _, observation, judgement = end.turn
+        first, last = self._mark_of(begin, task, seed), self._mark_of(end, task, seed)
         self._use(end)
-        observation = TurnObservation.between(before, after)
-        return TurnRun(_steps_of(nodes), prefix_digest, last.digest, last.touched, observation), judgement
+        return TurnRun(_steps_of(nodes), first.digest, last.digest, last.touched, observation), judgement
 
     def _walk(
         self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None]
@@ -140,17 +143,20 @@ class TransitionTree(Generic[T]):
         self._here = child
         return child
 
-    def _turn_end(self, node: _Node[T], task: Task, seed: int) -> tuple[StateInWords, T]:
-        if node.turn_end is None:
-            self._go_to(node, task, seed)
-            node.turn_end = self._simulator.in_words(task), self._judge(task)
-        return node.turn_end
-
     def _mark_of(self, node: _Node[T], task: Task, seed: int) -> Mark:
         if node.mark is None:
             self._go_to(node, task, seed)
             node.mark = self._simulator.mark()
         return node.mark
+
+    def _world_at(self, node: _Node[T], task: Task, seed: int) -> WorldMark:
+        mark = self._mark_of(node, task, seed)
+        if mark.world is not None:
+            return mark.world
+        if node.world is None:
+            self._go_to(node, task, seed)
+            node.world = self._simulator.world.mark()
+        return node.world
 
     def _go_to(self, node: _Node[T], task: Task, seed: int) -> None:
         """Bring the simulator to the state of a node."""

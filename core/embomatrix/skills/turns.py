@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from embomatrix.skills.describe import MAX_FINAL_LINES
 from embomatrix.skills.syntax import MAX_STEPS
 
 if TYPE_CHECKING:
@@ -39,30 +38,19 @@ class EpisodePrefix:
                 expected, found = ("to fail", "it succeeds") if step.ok else ("to succeed", "it fails")
                 reason = "" if step.failure is None else f" ({step.failure}: {step.message})"
                 raise PrefixMismatchError(
-                    f"call {index} of the prefix, {step.call.skill}: expected {expected} as recorded, found that {found}{reason}; "
-                    "begin the episode again"
+                    f"call {index} of the prefix, {step.call.skill}: expected {expected} as recorded, found that {found}"
+                    f"{reason}; begin the episode again"
                 )
         if self.digest not in ("", digest):
             raise PrefixMismatchError(
-                f"the digest after {self.length} calls of the prefix: expected {self.digest}, found {digest}; the platforms or "
-                "releases of two workers differ, or the calls do: begin the episode again"
+                f"the digest after {self.length} calls of the prefix: expected {self.digest[:100]!r}, found {digest!r}; "
+                "the platforms or releases of two workers differ, or the calls do: begin the episode again"
             )
 
     def after(self, steps: Sequence[Step], digest: str) -> EpisodePrefix:
         """Return the prefix that these further steps and the digest after them lead to."""
         failed = (self.length + index for index, step in enumerate(steps) if not step.ok)
-        return replace(
-            self, length=self.length + len(steps), failed=(*self.failed, *failed), digest=digest
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class StateInWords:
-    """State in words of the objects in a task's table, one line each in its order."""
-
-    room: str
-    held: tuple[str, ...]
-    lines: tuple[str, ...]
+        return replace(self, length=self.length + len(steps), failed=(*self.failed, *failed), digest=digest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +62,8 @@ class TurnObservation:
     held: tuple[str, ...]
     """Object in the robot's hand, then its contents; empty for an empty hand."""
     changes: tuple[str, ...]
-    """New lines of the table's objects that differ from the state before the turn, ``MAX_FINAL_LINES`` at most."""
-
-    @classmethod
-    def between(cls, before: StateInWords, after: StateInWords) -> TurnObservation:
-        """Return the observation of a turn that led from one state to another of the same task."""
-        changed = [new for old, new in zip(before.lines, after.lines, strict=True) if new != old]
-        left = len(changed) - MAX_FINAL_LINES
-        more = (f"and {left} more objects",) if left > 0 else ()
-        return cls(after.room, after.held, (*changed[:MAX_FINAL_LINES], *more))
+    """One line for each object of the task's table that the turn has changed or moved, in the table's order, as ``final_lines``
+    writes them."""
 
 
 def check_length(prefix: Plan, calls: Plan) -> None:

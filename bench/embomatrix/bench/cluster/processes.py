@@ -79,12 +79,19 @@ class BenchCluster:
 
 @contextlib.contextmanager
 def bench_cluster(
-    folder: Path, *, workers: int, slots: int, deadline_s: float, load_delay_s: float = 0.0, state: str = ""
+    folder: Path,
+    *,
+    workers: int,
+    slots: int,
+    deadline_s: float,
+    load_delay_s: float = 0.0,
+    state: str = "",
+    sharing: bool = False,
 ) -> Iterator[BenchCluster]:
     """Start the processes, with state and logs below ``folder``, and end them at exit.
 
     ``state`` is the URL of the manager's store, the embedded one by default. With ``load_delay_s`` every scene loads so many
-    seconds later. Workers may still be connecting. Raise BenchError if the manager does not serve at ``deadline_s`` of the
+    seconds later. With ``sharing``, slots execute the calls that plans have in common once. Workers may still be connecting. Raise BenchError if the manager does not serve at ``deadline_s`` of the
     monotonic clock.
     """
     with contextlib.ExitStack() as started:
@@ -93,7 +100,7 @@ def bench_cluster(
         address = manager.wait_for(SERVES, deadline_s)[1]
         daemons = tuple(
             started.enter_context(
-                running_process(folder, name, *_worker_command(folder, address, name, slots, load_delay_s))
+                running_process(folder, name, *_worker_command(folder, address, name, slots, load_delay_s, sharing=sharing))
             )
             for name in (f"worker-{number}" for number in range(1, workers + 1))
         )
@@ -101,7 +108,7 @@ def bench_cluster(
 
 
 def _worker_command(
-    folder: Path, address: str, name: str, slots: int, load_delay_s: float
+    folder: Path, address: str, name: str, slots: int, load_delay_s: float, *, sharing: bool
 ) -> tuple[str, ...]:
     cache = folder / "cache" / name
     if load_delay_s:
@@ -110,7 +117,7 @@ def _worker_command(
     worker = ("embomatrix.cli", "worker", "run", f"--manager={address}", f"--name={name}", f"--slots={slots}")
     # Manager, workers and trainer share the cores at equal priority.
     # Plans that repeat would measure a look-up, not an execution.
-    return (*worker, f"--cache-dir={cache}", "--nice=0", "--no-sharing")
+    return (*worker, f"--cache-dir={cache}", "--nice=0", *(() if sharing else ("--no-sharing",)))
 
 
 def running_manager(folder: Path, *options: str) -> contextlib.AbstractContextManager[Process]:

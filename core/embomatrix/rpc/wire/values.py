@@ -14,6 +14,7 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Step
+from embomatrix.skills.turns import EpisodePrefix, TurnObservation
 
 Reader = Callable[[bytes], object]
 
@@ -51,7 +52,7 @@ class _ReadWhenAsked:
 class Rollout(_ReadWhenAsked):
     """One plan to execute once. The plans of one task in one batch share ``group_id`` and ``seed``."""
 
-    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render"})
+    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render", "prefix"})
 
     rollout_id: str
     group_id: str
@@ -61,10 +62,16 @@ class Rollout(_ReadWhenAsked):
     seed: int
     render: bool = False
     """Needs a slot that renders on a GPU."""
+    prefix: EpisodePrefix | None = None
+    """Calls of the plan that its episode has made before, if this is a turn of an episode."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on unchanged; a modified copy has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
     """Parser of ``wire`` for the empty slots; None once everything is parsed."""
+
+    @property
+    def is_turn(self) -> bool:
+        return self.prefix is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +84,11 @@ class Batch:
     rollouts: tuple[Rollout, ...]
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, as for a rollout."""
+
+    @property
+    def has_turns(self) -> bool:
+        """True if its rollouts are turns of episodes: then all are."""
+        return bool(self.rollouts) and self.rollouts[0].is_turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +111,7 @@ class Timings:
 class Completed(_ReadWhenAsked):
     """Executed and scored plan: evidence about the policy, with any reward."""
 
-    _left = frozenset({"reward", "steps", "final", "trace_digest"})
+    _left = frozenset({"reward", "steps", "final", "trace_digest", "observation"})
 
     reward: RewardBreakdown
     steps: tuple[Step, ...]
@@ -108,6 +120,8 @@ class Completed(_ReadWhenAsked):
     worker_id: str
     timings: Timings
     warm: bool
+    observation: TurnObservation | None = None
+    """Observation of a turn, whose ``steps`` are those after its prefix."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on with the ``noted`` fields replaced; a copy with other changes has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
@@ -122,7 +136,16 @@ class Completed(_ReadWhenAsked):
         warm = self.warm if warm is None else warm
         if self.read is not None:
             return Completed.unread(self.wire, self.read, timings=timings, warm=warm, worker_id=worker_id)
-        copy = Completed(self.reward, self.steps, self.final, self.trace_digest, worker_id, timings, warm)
+        copy = Completed(
+            self.reward,
+            self.steps,
+            self.final,
+            self.trace_digest,
+            worker_id,
+            timings,
+            warm,
+            self.observation,
+        )
         object.__setattr__(copy, "wire", self.wire)
         return copy
 
@@ -143,6 +166,7 @@ class InfraCode(StrEnum):
     SLOT_OOM = "slot_oom"
     VERSION_SKEW = "version_skew"
     RESULT_MISMATCH = "result_mismatch"
+    PREFIX_MISMATCH = "prefix_mismatch"
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Timin
 from embomatrix.sim.zygote import PipeMessage
 from embomatrix.worker.slots.processes import ProcessGoneError
 from embomatrix.worker.slots.residents import Residents, ResidentScene, Slot
+from embomatrix.worker.slots.slot_program import SOUND
 
 TakeMore = Callable[[int], Sequence["HeldLease"]]
 Finish = Callable[["HeldLease", Completed | InfraFailure], None]
@@ -137,7 +138,10 @@ class SlotRun:
         held = self.queue.popleft()
         if "error" in answer.header:
             finish(held, InfraFailure(InfraCode(answer.header["code"]), answer.header["error"]))
-            return False
+            sound = bool(answer.header.get(SOUND))
+            if sound and self.queue:
+                self.queue[0].first_since_s = time.monotonic()
+            return sound
         _wear(slot, float(answer.header["resident_mb"]))
         finish(held, self._completed(held, answer))
         if self.queue:
@@ -170,6 +174,8 @@ class SlotRun:
 
     def _pause_s(self) -> float:
         """Time that answers may wait in the stream."""
+        if any(held.lease.rollout.is_turn for held in self.queue):
+            return 0.0  # clients wait
         longest_s = GATHER_SHARE * self.scene.execute_mean_s * (len(self.queue) - 1)
         if longest_s < LEAST_GATHER_S:
             return 0.0
