@@ -89,7 +89,9 @@ class TransitionTree(Generic[T]):
 
         Equal to ``Simulator.execute_turn`` and a judgement of the final state.
         """
-        self._mark_of(self._start(task, seed), task, seed)  # while the simulator is there, if it must go there
+        self._mark_of(
+            self._start(task, seed), task, seed
+        )  # while the simulator is there, if it must go there
         nodes, _ = self._walk(task, plan, seed, prefix, on_step)
         begin, end = nodes[prefix], nodes[-1]
         if end.turn is None or end.turn[0] != prefix:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
-from embomatrix.rpc.wire.bounds import check
+from embomatrix.rpc.wire.bounds import TURNS, check
 from embomatrix.rpc.wire.codec import (
     ConvertError,
     converters,
@@ -243,6 +243,8 @@ def turn_from_proto(message: types_pb2.Rollout) -> Rollout:
 
 
 def checked_turns(turns: tuple[Rollout, ...]) -> tuple[Rollout, ...]:
-    """Return the turns of one request. Raise ConvertError for a repeated id, since each turn gets exactly one result."""
+    """Return the turns of one request. Raise ConvertError for none, and for a repeated id: each turn gets one result."""
+    if not turns:
+        raise ConvertError("turns", f"found none: expected 1 to {TURNS}")
     _check_unique("turns", turns)
     return turns
