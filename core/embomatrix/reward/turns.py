@@ -24,7 +24,7 @@ class Turn:
     reward: RewardBreakdown
     """Reward of all calls so far, as if the episode ended here."""
     digest: str
-    """Digest of the trace of all calls so far."""
+    """Digest of the episode so far: its task, its seed, and the states after all its calls."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,8 +79,9 @@ class Mark:
 
     @property
     def digest(self) -> str:
-        """Digest of the trace so far."""
-        return f"sha256:{self.hash.hexdigest()}"
+        """Digest of the episode so far: its task, its seed, and every pose and state after every call."""
+        episode = f"{self.task.task_id}\n{self.seed}\n".encode() + self.hash.digest()
+        return f"sha256:{hashlib.sha256(episode).hexdigest()}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +91,9 @@ class TurnRun:
     steps: tuple[Step, ...]
     """Those of the prefix, then the others."""
     prefix_digest: str
-    """Digest of the trace after the prefix."""
+    """Digest of the episode after the prefix."""
     digest: str
-    """Digest of the trace after all steps."""
+    """Digest of the episode after all steps."""
     touched: frozenset[str]
     """Objects on which a call succeeded."""
     observation: TurnObservation

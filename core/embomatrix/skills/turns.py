@@ -29,7 +29,7 @@ class EpisodePrefix:
     failed: tuple[int, ...] = ()
     """Indices of the calls that failed, rising. The episode went on after them."""
     digest: str = ""
-    """Digest of the trace after these calls; empty if unknown, which is not checked."""
+    """Digest of the episode after these calls; empty if unknown, which is not checked."""
 
     def check(self, steps: Sequence[Step], digest: str) -> None:
         """Raise PrefixMismatchError unless these steps of the prefix, and the digest after them, are the expected ones."""

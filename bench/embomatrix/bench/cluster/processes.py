@@ -91,7 +91,9 @@ def bench_cluster(
     """Start the processes, with state and logs below ``folder``, and end them at exit.
 
     ``state`` is the URL of the manager's store, the embedded one by default. With ``load_delay_s`` every scene loads so many
-    seconds later. With ``sharing``, slots execute the calls that plans have in common once. Workers may still be connecting. Raise BenchError if the manager does not serve at ``deadline_s`` of the
+    seconds later. With ``sharing``, slots execute the calls that plans have in common once.
+
+    Workers may still be connecting. Raise BenchError if the manager does not serve at ``deadline_s`` of the
     monotonic clock.
     """
     with contextlib.ExitStack() as started:
@@ -100,7 +102,11 @@ def bench_cluster(
         address = manager.wait_for(SERVES, deadline_s)[1]
         daemons = tuple(
             started.enter_context(
-                running_process(folder, name, *_worker_command(folder, address, name, slots, load_delay_s, sharing=sharing))
+                running_process(
+                    folder,
+                    name,
+                    *_worker_command(folder, address, name, slots, load_delay_s, sharing=sharing),
+                )
             )
             for name in (f"worker-{number}" for number in range(1, workers + 1))
         )

@@ -57,7 +57,10 @@ class Script:
 
 
 def bench_turns(workload: Workload, sizes: TurnSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
-    """Measure the workload's main scenes. Raise BenchError if a process ends or the time is up, ClusterError for a failed turn."""
+    """Measure the workload's main scenes.
+
+    Raise BenchError if a process ends or the time is up, ClusterError for a failed turn.
+    """
     deadline_s = time.monotonic() + sizes.limit_s
     main = workload.main
     scripts = episode_scripts(main, sizes.calls)

@@ -194,7 +194,7 @@ class EpisodePrefix(google.protobuf.message.Message):
     length: builtins.int
     """Number of calls."""
     digest: builtins.str
-    """Digest of the trace after these calls; empty if unknown, which is not checked."""
+    """`trace_digest` of the result after these calls; empty if unknown, which is not checked."""
     @property
     def failed(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
         """Indices of the calls that failed, rising. The episode went on after them."""
@@ -417,7 +417,7 @@ class Completed(google.protobuf.message.Message):
     def timings(self) -> Global___Timings: ...
     @property
     def observation(self) -> Global___TurnObservation:
-        """Set for a turn; `steps` are then those after the prefix, and `final_state` is empty."""
+        """Set for a turn; `steps` are then those after the prefix, `final_state` is empty, and `trace_digest` covers the prefix too."""
 
     def __init__(
         self,
