@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import random
+import re
+from pathlib import Path
 
 import pytest
 from tests.fakes.plans import plan_of
@@ -151,3 +153,15 @@ async def test_local_episode_checks_its_prefix_too():
         episode.prefix = EpisodePrefix(1, (), "sha256:0")
         with pytest.raises(PrefixMismatchError, match="the digest after 1 calls"):
             await episode.act([CALLS[1]])
+
+
+async def test_examples_of_the_page_run_and_agree(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "episodes.md").read_text(encoding="utf-8")
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(block, "docs/episodes.md", "exec"), names)
+    async with real_cluster(tmp_path, "w1") as (cluster, _, _):
+        far = await names["play_on_a_cluster"](cluster.address, DATA, TASK.task_id)
+    near = await names["play_here"](DATA, TASK.task_id)
+    assert far == near
+    assert len(far) == 3
