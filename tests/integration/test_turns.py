@@ -72,7 +72,7 @@ async def settled(client):
 
 def alive(kind):
     gc.collect()
-    return sum(isinstance(item, kind) for item in gc.get_objects())
+    return sum(type(item) is kind for item in gc.get_objects())
 
 
 async def test_each_turn_has_one_result_in_order(tmp_path):

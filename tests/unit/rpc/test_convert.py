@@ -142,7 +142,7 @@ def test_batch_round_trips(rollouts, name, step):
     assert convert.batch_from_proto(_over_the_wire(convert.batch_to_proto(batch))) == batch
 
 
-@given(st.lists(TURNS, max_size=4, unique_by=lambda turn: turn.rollout_id).map(tuple), NAMES)
+@given(st.lists(TURNS, min_size=1, max_size=4, unique_by=lambda turn: turn.rollout_id).map(tuple), NAMES)
 def test_turns_round_trip(turns, run_id):
     message = _over_the_wire(convert.turns_to_proto(run_id, turns))
     assert message.run_id == run_id

@@ -112,7 +112,7 @@ def _plan_from(calls: Sequence[bytes]) -> Plan:
     return each_known("plan", _call_of, calls)
 
 
-prefix_to_proto, prefix_from_proto = converters(EpisodePrefix, types_pb2.EpisodePrefix)
+_prefix_to_proto, _prefix_from_proto = converters(EpisodePrefix, types_pb2.EpisodePrefix)
 
 
 def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
@@ -129,7 +129,7 @@ def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     message.render = rollout.render
     if rollout.prefix is not None:
         message.prefix.SetInParent()
-        message.prefix.MergeFrom(prefix_to_proto(rollout.prefix))
+        message.prefix.MergeFrom(_prefix_to_proto(rollout.prefix))
 
 
 rollout_to_proto = maker(types_pb2.Rollout, write_rollout)
@@ -169,7 +169,7 @@ def unread_rollout(message: types_pb2.Rollout) -> Rollout:
 
 
 def _prefix_in(message: types_pb2.Rollout) -> EpisodePrefix | None:
-    return inside("prefix", prefix_from_proto, message.prefix) if message.HasField("prefix") else None
+    return inside("prefix", _prefix_from_proto, message.prefix) if message.HasField("prefix") else None
 
 
 def _check_prefix(rollout: Rollout) -> None:
