@@ -72,7 +72,11 @@ class LocalEpisodes:
     async def _take_turn(self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix) -> Turn:
         await asyncio.sleep(0)  # other episodes take turns
         scene = self._scene(start.bundle_digest)
-        task = scene.bundle.tasks[start.task_id]
+        tasks = scene.bundle.tasks
+        task = tasks.get(start.task_id)
+        if task is None:
+            name = f"bundle {start.bundle_digest} has no task {start.task_id!r}"
+            raise KeyError(f"{name}: expected one of its {len(tasks)} tasks")
         run, judgement = scene.tree.execute_turn(task, plan, start.seed, prefix.length)
         prefix.check(run.steps[: prefix.length], run.prefix_digest)
         return Turn(

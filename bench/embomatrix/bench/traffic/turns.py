@@ -47,7 +47,7 @@ class TurnSizes:
 
 
 @dataclass(frozen=True, slots=True)
-class Script:
+class EpisodeScript:
     """Calls of one episode."""
 
     bundle_digest: str
@@ -84,7 +84,7 @@ def bench_turns(workload: Workload, sizes: TurnSizes, on_step: Callable[[str], N
         return asyncio.run(measure())
 
 
-def episode_scripts(workload: Workload, calls: int) -> Iterator[Script]:
+def episode_scripts(workload: Workload, calls: int) -> Iterator[EpisodeScript]:
     """Yield the scripts of episodes without end, in turn from each scene, and no two with equal task and seed.
 
     Each joins plans of one task: calls that do not fit the state fail, and the episode goes on.
@@ -92,7 +92,7 @@ def episode_scripts(workload: Workload, calls: int) -> Iterator[Script]:
     return _alternating([_scripts_of(scene, calls) for scene in workload.scenes])
 
 
-def _scripts_of(scene: SceneWork, calls: int) -> Iterator[Script]:
+def _scripts_of(scene: SceneWork, calls: int) -> Iterator[EpisodeScript]:
     by_task: dict[str, list[Execution]] = defaultdict(list)
     for execution in scene.executions:
         by_task[execution.task_id].append(execution)
@@ -103,18 +103,18 @@ def _scripts_of(scene: SceneWork, calls: int) -> Iterator[Script]:
             same = by_task[execution.task_id]
             rest = (call for other in islice(cycle(same), at, None) for call in other.plan)
             plan = tuple(islice((call for part in (execution.plan, rest) for call in part), calls))
-            yield Script(scene.bundle_digest, execution.task_id, execution.seed + number * most, plan)
+            yield EpisodeScript(scene.bundle_digest, execution.task_id, execution.seed + number * most, plan)
         number += 1
 
 
-def _alternating(sources: Sequence[Iterator[Script]]) -> Iterator[Script]:
+def _alternating(sources: Sequence[Iterator[EpisodeScript]]) -> Iterator[EpisodeScript]:
     while True:
         for source in sources:
             yield next(source)
 
 
 async def _measured(
-    episodes: Episodes, scripts: Iterator[Script], sizes: TurnSizes, on_step: Callable[[str], None]
+    episodes: Episodes, scripts: Iterator[EpisodeScript], sizes: TurnSizes, on_step: Callable[[str], None]
 ) -> tuple[Figure, ...]:
     await _together(episodes, scripts, sizes.together, 1)  # slots are forked and have loaded all code
     on_step("episodes one after another")
@@ -138,7 +138,9 @@ async def _measured(
     )
 
 
-async def _together(episodes: Episodes, scripts: Iterator[Script], count: int, rounds: int) -> list[float]:
+async def _together(
+    episodes: Episodes, scripts: Iterator[EpisodeScript], count: int, rounds: int
+) -> list[float]:
     """Play ``count`` episodes at a time, ``rounds`` of them one after another. Return the seconds of each turn."""
 
     async def play() -> list[float]:
@@ -148,7 +150,7 @@ async def _together(episodes: Episodes, scripts: Iterator[Script], count: int, r
     return [wait_s for each in played for wait_s in each]
 
 
-async def _play(episodes: Episodes, script: Script) -> list[float]:
+async def _play(episodes: Episodes, script: EpisodeScript) -> list[float]:
     """Play one episode call by call. Return the seconds of each turn."""
     episode = episodes.begin(script.bundle_digest, script.task_id, script.seed)
     waits_s = []
