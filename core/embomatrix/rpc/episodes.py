@@ -75,6 +75,7 @@ class Episodes:
         """Give up the turns that are still awaited."""
         for turn in self._waiting:
             turn.outcome.cancel()
+        self._waiting.clear()
         for task in self._sending:
             task.cancel()
         await asyncio.gather(*self._sending, return_exceptions=True)

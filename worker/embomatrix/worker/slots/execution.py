@@ -29,6 +29,8 @@ Finish = Callable[["HeldLease", Completed | InfraFailure], None]
 ROLLOUTS_PER_SLOT: Final = 5_000
 GROWTH_MB: Final = 128.0
 """A slot's process is replaced after this many rollouts, or if it has grown by this much."""
+TURN_WEAR: Final = 0.1
+"""Rollouts that a turn of an episode counts for: it has one new call, and a new process must execute prefixes again."""
 AHEAD_S: Final = 0.06
 """Execution time of the leases in a slot's stream. Other slots can't take them over, and the manager can't take them back."""
 MOST_AHEAD: Final = 24
@@ -142,7 +144,7 @@ class SlotRun:
             if sound and self.queue:
                 self.queue[0].first_since_s = time.monotonic()
             return sound
-        _wear(slot, float(answer.header["resident_mb"]))
+        _wear(slot, float(answer.header["resident_mb"]), TURN_WEAR if held.lease.rollout.is_turn else 1.0)
         finish(held, self._completed(held, answer))
         if self.queue:
             self.queue[0].first_since_s = time.monotonic()
@@ -204,8 +206,8 @@ def _frame(held: HeldLease) -> PipeMessage:
     return PipeMessage(header, lease.rollout.wire or rollout_to_proto(lease.rollout).SerializeToString())
 
 
-def _wear(slot: Slot, resident_mb: float) -> None:
-    """Count a rollout; a slot with many rollouts, or one that has grown, is worn."""
-    slot.rollouts += 1
+def _wear(slot: Slot, resident_mb: float, rollouts: float) -> None:
+    """Count rollouts; a slot with many rollouts, or one that has grown, is worn."""
+    slot.rollouts += rollouts
     slot.first_mb = slot.first_mb or resident_mb
     slot.worn = slot.rollouts >= ROLLOUTS_PER_SLOT or resident_mb > slot.first_mb + GROWTH_MB
