@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import dataclasses
 from dataclasses import dataclass, field
 
 import grpc
@@ -31,6 +32,7 @@ from embomatrix.rpc.wire.values import (
     Timings,
 )
 from embomatrix.skills.trace import Step
+from embomatrix.skills.turns import TurnObservation
 
 
 def completed(worker_id="w1", reward=PAPER, plan=(), holds=(True, False)):
@@ -43,6 +45,19 @@ def completed(worker_id="w1", reward=PAPER, plan=(), holds=(True, False)):
         reward.format, relevance, reward.goal * sum(holds) / len(holds), atoms, success=all(holds)
     )
     return Completed(scored, steps, (), "sha256:trace", worker_id, Timings(execute_s=0.001), warm=True)
+
+
+def completed_turn(turn, worker_id="w1", reward=PAPER):
+    """Return the outcome of a turn whose new calls all succeed, after a prefix with the failures that it names."""
+    done = tuple(call for index, call in enumerate(turn.plan) if index not in turn.prefix.failed)
+    whole = completed(worker_id, reward, done)
+    further = turn.plan[turn.prefix.length :]
+    return dataclasses.replace(
+        whole,
+        steps=whole.steps[len(done) - len(further) :],
+        trace_digest=f"sha256:{len(turn.plan)}",
+        observation=TurnObservation("kitchen_0", (), (f"{len(turn.plan)} calls",)),
+    )
 
 
 @dataclass
@@ -76,6 +91,10 @@ class FakeWorker:
     paused: str = ""
     lies: bool = False
     """True if it reports that plans reached nothing of their goal."""
+    old: bool = False
+    """True if it executes turns like other rollouts, as a worker does that does not know them."""
+    strange: bool = False
+    """True if prefixes of turns have other digests here, as on another platform."""
     resumed: bool = False
     labels: dict = field(default_factory=dict)
 
@@ -225,6 +244,11 @@ class FakeWorker:
         if lease.rollout.task_id in self.poison:
             crashed = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", self.worker_id)
             self.report(lease.ref, crashed, slot)
+        elif lease.rollout.is_turn and self.strange and lease.rollout.prefix.digest:
+            mismatch = InfraFailure(InfraCode.PREFIX_MISMATCH, "expected a, found b", self.worker_id)
+            self.report(lease.ref, mismatch, slot)
+        elif lease.rollout.is_turn and not self.old:
+            self.report(lease.ref, completed_turn(lease.rollout, self.worker_id, lease.reward), slot)
         else:
             holds = (False, False) if self.lies else (True, False)
             outcome = completed(self.worker_id, lease.reward, lease.rollout.plan, holds)

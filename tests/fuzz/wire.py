@@ -6,6 +6,7 @@ machine.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import random
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +33,14 @@ from embomatrix.rpc.wire.bounds import parsed
 from embomatrix.rpc.wire.codec import ConvertError, each, inside
 from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto, rollout_result_to_proto
-from embomatrix.rpc.wire.rollout import batch_from_proto, batch_to_proto, rollout_to_proto
+from embomatrix.rpc.wire.rollout import (
+    batch_from_proto,
+    batch_to_proto,
+    checked_turns,
+    rollout_to_proto,
+    turn_from_proto,
+    turns_to_proto,
+)
 from embomatrix.rpc.wire.run import (
     group_done_from_proto,
     lookahead_answer_from_proto,
@@ -67,6 +75,7 @@ from embomatrix.rpc.wire.tokens import role_from_proto, token_info_from_proto
 from embomatrix.rpc.wire.training import training_report_from_proto, training_report_to_proto
 from embomatrix.rpc.wire.values import Completed, Rollout, RolloutResult
 from embomatrix.skills.syntax import PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.skills.turns import EpisodePrefix
 
 Use = Callable[[Any], object]
 PLAN: Plan = (
@@ -77,6 +86,7 @@ PLAN: Plan = (
     SkillCall(Skill.COOK, object_index=1, source_index=2),
 )
 ROLLOUT = Rollout("r-1", "g-1", "sha256:" + "0" * 64, "open-fridge", PLAN, 3)
+TURN = dataclasses.replace(ROLLOUT, prefix=EpisodePrefix(3, (1,), "sha256:" + "1" * 64))
 
 
 def _again(convert: Callable[[Any], Any], back: Callable[[Any], Message]) -> Use:
@@ -131,6 +141,10 @@ REQUEST_USES: Mapping[str, Use] = {
         "entries", _again(lookahead_entry_from_proto, lookahead_entry_to_proto), message.entries
     ),
     "ExecuteRequest": _again(batch_from_proto, batch_to_proto),
+    "StepRequest": _again(
+        lambda message: checked_turns(each("turns", turn_from_proto, message.turns)),
+        lambda turns: turns_to_proto("run", turns),
+    ),
     "ReportTrainingRequest": _again(
         training_report_from_proto, lambda report: training_report_to_proto("run", report)
     ),
@@ -146,18 +160,22 @@ def _leases(message: worker_service_pb2.SessionResponse) -> object:
 
 
 def _results(message: rollout_service_pb2.ExecuteResponse) -> object:
-    groups = each("groups", group_done_from_proto, message.groups)
+    return each("groups", group_done_from_proto, message.groups), _each_result(message)
+
+
+def _each_result(message: rollout_service_pb2.ExecuteResponse | rollout_service_pb2.StepResponse) -> object:
     results = each("results", rollout_result_from_proto, message.results)
     for result in results:
         written = rollout_result_to_proto(result)
         rollout_result_from_proto(type(written).FromString(written.SerializeToString()))
-    return results, groups
+    return results
 
 
 ANSWER_USES: Mapping[str, Use] = {
     "SessionResponse": _leases,
     "ExecuteResponse": _results,
     "WaitExecutionResponse": _results,
+    "StepResponse": _each_result,
     "AnnounceLookaheadResponse": lambda message: each(
         "answers", lookahead_answer_from_proto, message.answers
     ),
@@ -261,6 +279,10 @@ def _sound() -> Mapping[str, list[Message]]:
     delivered.completed.CopyFrom(result.completed)
     answer = rollout_service_pb2.ExecuteResponse(results=[delivered])
     answer.groups.add(group_id="g-1", completed=1)
+    turned = types_pb2.RolloutResult(rollout_id="r-1", group_id="g-1", attempt=1)
+    turned.completed.CopyFrom(result.completed)
+    turned.completed.observation.room = "kitchen_0"
+    turned.completed.observation.changes.append("apple_1: on table_1 in kitchen_0")
     report = rollout_service_pb2.ReportTrainingRequest(run_id="run-1", phase="grpo", step=1)
     report.figures["reward"] = 0.5
     report.plans.add(task_id="t", text="move 1", advantage=0.1).steps.add(skill="move", ok=True)
@@ -277,6 +299,8 @@ def _sound() -> Mapping[str, list[Message]]:
         "ExecuteRequest": [
             rollout_service_pb2.ExecuteRequest(run_id="run-1", batch_id="b-1", rollouts=[rollout])
         ],
+        "StepRequest": [turns_to_proto("run-1", (TURN,))],
+        "StepResponse": [rollout_service_pb2.StepResponse(results=[turned])],
         "ReportTrainingRequest": [report],
         "SessionResponse": [
             worker_service_pb2.SessionResponse(leases=[lease], acknowledged=[ref], cancelled=[ref])

@@ -28,6 +28,7 @@ from embomatrix.sim.live_world import prepare
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.zygote import private_mb
 from embomatrix.skills.syntax import MAX_STEPS
+from embomatrix.skills.turns import EpisodePrefix
 from embomatrix.worker.slots.pool import SlotPool
 from embomatrix.worker.slots.residents import SlotLimits
 from embomatrix.world.bundle import Bundle, encode_bundle
@@ -81,9 +82,9 @@ class Harness:
     def _take(self, result):
         self.results[result.ref.lease_id] = result.outcome
 
-    def submit(self, lease_id, plan=(), *, seed=1, digest="", deadline_s=30.0, reward=PAPER):
+    def submit(self, lease_id, plan=(), *, seed=1, digest="", deadline_s=30.0, reward=PAPER, prefix=None):
         task = next(iter(self.bundle.tasks))
-        rollout = Rollout(lease_id, "g", digest or self.digest, task, plan, seed)
+        rollout = Rollout(lease_id, "g", digest or self.digest, task, plan, seed, prefix=prefix)
         self.pool.submit(Lease(LeaseRef(lease_id, 1), rollout, deadline_s, reward=reward))
 
     def plan(self, text):
@@ -156,6 +157,25 @@ async def test_equal_plans_have_equal_digests_in_every_slot(tmp_path, kitchen, s
         found = answer.stdout.split()
         expected = [digest for [digest] in digests]
         assert found == (expected if order is words else expected[::-1])
+
+
+@pytest.mark.parametrize("sharing", [True, False])
+async def test_mismatch_of_a_prefix_costs_no_slot_and_no_other_turn(tmp_path, kitchen, sharing):
+    async with running(tmp_path, kitchen, sharing=sharing) as harness:
+        plan = harness.plan(PLANS[3])
+        harness.submit("first", plan[:1], prefix=EpisodePrefix())
+        first = await harness.outcome("first")
+        (slot,) = harness.slots()
+        harness.submit("wrong", plan, prefix=EpisodePrefix(1, (), "sha256:0"))
+        harness.submit("again", plan, prefix=EpisodePrefix(1, (), first.trace_digest))
+        harness.submit("plain", plan)
+        wrong, again, plain = [await harness.outcome(name) for name in ("wrong", "again", "plain")]
+        assert harness.slots() == [slot]
+    assert wrong.code is InfraCode.PREFIX_MISMATCH
+    assert f"expected 'sha256:0', found '{first.trace_digest}'" in wrong.message
+    assert again.steps == plain.steps[1:]
+    assert again.reward == plain.reward
+    assert (again.observation is None, plain.observation is None) == (False, True)
 
 
 def _words(call):

@@ -36,7 +36,7 @@ from embomatrix.rpc.status import (
 from embomatrix.rpc.versions import MERGING_VERSION, SPOKEN, agree, capabilities_of
 from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
-from embomatrix.rpc.wire.rollout import batch_to_proto, merged
+from embomatrix.rpc.wire.rollout import batch_to_proto, merged, turns_to_proto
 from embomatrix.rpc.wire.run import (
     group_done_from_proto,
     lookahead_answer_from_proto,
@@ -50,6 +50,7 @@ from embomatrix.rpc.wire.values import (
     GroupDone,
     LookaheadAnswer,
     LookaheadEntry,
+    Rollout,
     RolloutResult,
     RunStats,
     RunTerms,
@@ -69,6 +70,8 @@ class ClientLimits:
     """Upload of one bundle."""
     batch_s: float = 600.0
     """Outcome of every rollout of a batch."""
+    turn_s: float = 120.0
+    """Result of one turn of an episode, with all retries."""
     retry_first_s: float = 0.1
     """First wait before a broken stream is attached again. It doubles with each attempt without progress."""
     retry_longest_s: float = 2.0
@@ -100,6 +103,10 @@ class ClusterClient(AdminClient):
         self._merging = merging
         self._merges = False
         """True once the manager is known to accept merged rollouts."""
+
+    @property
+    def limits(self) -> ClientLimits:
+        return self._limits
 
     @property
     def _rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
@@ -229,6 +236,21 @@ class ClusterClient(AdminClient):
             raise attached.explain(cluster_error(error, self._address)) from error
         finally:
             call.cancel()
+
+    @of_the_leader
+    async def step(
+        self, run_id: str, turns: Sequence[Rollout], *, timeout_s: float | None = None
+    ) -> tuple[RolloutResult, ...]:
+        """Execute turns of episodes, rollouts with a prefix, and return the one result of each in order.
+
+        ``Episodes`` of ``embomatrix.rpc.episodes`` sends the turns of many episodes together, and again after errors.
+        """
+        limit_s = self._limits.turn_s if timeout_s is None else timeout_s
+        answer = await self._rollouts.Step(turns_to_proto(run_id, turns), timeout=limit_s)
+        results = each("results", rollout_result_from_proto, answer.results)
+        if [result.rollout_id for result in results] != [turn.rollout_id for turn in turns]:
+            raise InternalError("the manager sent results of other turns than it was asked for")
+        return results
 
     @of_the_leader
     async def cancel(self, run_id: str, batch_id: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from embomatrix.skills.check import check
 from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
 from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.skills.trace import Step, Trace
+from embomatrix.skills.turns import TurnObservation
 from embomatrix.skills.view import SkillRefusal, source_of, target_of
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.state import State
@@ -75,6 +76,27 @@ class Mark:
     hash: hashlib._Hash
     world: WorldMark | None
     """None in such a mode."""
+
+    @property
+    def digest(self) -> str:
+        """Digest of the episode so far: its task, its seed, and every pose and state after every call."""
+        episode = f"{self.task.task_id}\n{self.seed}\n".encode() + self.hash.digest()
+        return f"sha256:{hashlib.sha256(episode).hexdigest()}"
+
+
+@dataclass(frozen=True, slots=True)
+class TurnRun:
+    """Execution of a turn: the calls of a prefix, which may fail, and further calls up to the first failure."""
+
+    steps: tuple[Step, ...]
+    """Those of the prefix, then the others."""
+    prefix_digest: str
+    """Digest of the episode after the prefix."""
+    digest: str
+    """Digest of the episode after all steps."""
+    touched: frozenset[str]
+    """Objects on which a call succeeded."""
+    observation: TurnObservation
 
 
 class StepRandom:
@@ -184,6 +206,13 @@ class Simulator:
             world,
         )
 
+    def mark_after_failure(self, before: Mark) -> Mark:
+        """Return the present state after one call that failed, given the mark before it.
+
+        Where failed calls change nothing, the two share the state of the world.
+        """
+        return self.mark() if before.world is None else replace(before, hash=self._hash.copy())
+
     def return_to(self, mark: Mark) -> None:
         """Take on a state that this simulator marked: all that follows is bit-equal to what followed then.
 
@@ -224,6 +253,24 @@ class Simulator:
             digest=f"sha256:{self._hash.hexdigest()}",
         )
 
+    def execute_turn(
+        self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> TurnRun:
+        """Reset and run the plan. Failures end it only after the first ``prefix`` calls."""
+        self.reset(task, seed)
+        steps: list[Step] = []
+        for call in plan[:prefix]:
+            steps.append(self.run_step(call))
+            on_step(len(steps))
+        start, before = self.mark(), self.world.mark()
+        for call in plan[prefix:]:
+            steps.append(self.run_step(call))
+            on_step(len(steps))
+            if not steps[-1].ok:
+                break
+        end = self.mark()
+        return TurnRun(tuple(steps), start.digest, end.digest, end.touched, self.observe(task, before))
+
     def describe(self, task: Task) -> tuple[str, ...]:
         """State in words of the goal's objects and of those that a call succeeded on, in the table's order."""
         described = task.goal_objects | self._touched
@@ -233,6 +280,12 @@ class Simulator:
     def survey(self, task: Task) -> tuple[str, ...]:
         """State in words of every object in the task's table, in its order; it reveals nothing about the goal."""
         return final_lines([self._description(name) for name in task.table])
+
+    def observe(self, task: Task, before: WorldMark) -> TurnObservation:
+        """Describe the present state and what has changed since another state of this task."""
+        changed = self.world.mark().changed_since(before)
+        descriptions = [self._description(name) for name in task.table if name in changed]
+        return TurnObservation(self.world.robot_room, self.world.carried, final_lines(descriptions))
 
     def warm_up(self) -> Iterator[None]:
         """Compute cached values ahead of their first use, a little per step. Changes no answer.

@@ -1,5 +1,7 @@
 """State of a rollout: the engine's scene, the symbolic states, the robot's base and its hand."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -51,6 +53,19 @@ class WorldMark:
     unread: Unread
     acting: frozenset[str]
     table: tuple[str, ...]
+
+    def changed_since(self, before: WorldMark) -> set[str]:
+        """Return the objects whose place, states, substances or presence differ from those in an earlier state."""
+        parts: tuple[tuple[Mapping[str, object], Mapping[str, object]], ...] = (
+            (self.engine, before.engine),
+            (self.states, before.states),
+            (self.substances, before.substances),
+            (self.hand.offsets, before.hand.offsets),
+        )
+        found = self.absent ^ before.absent
+        for now, then in parts:
+            found |= {name for name in now.keys() | then.keys() if now.get(name) != then.get(name)}
+        return set(found)
 
 
 class Hand:
@@ -190,6 +205,8 @@ class LiveWorld:
 
     def return_to(self, mark: WorldMark) -> None:
         """Take on a state of this world since the last reset. All that follows is bit-equal to what followed then."""
+        # By way of the start: caches of the scene as loaded are valid again, and the journal of changes stays short.
+        self.engine.reset()
         self.engine.return_to(mark.engine)
         self.states.return_to(mark.states)
         self.substances.return_to(mark.substances)

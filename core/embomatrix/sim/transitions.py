@@ -11,10 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
 
+from embomatrix.sim.executor import TurnRun
+
 if TYPE_CHECKING:
     from embomatrix.sim.executor import Mark, Simulator
+    from embomatrix.sim.live_world import WorldMark
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.trace import Step, Trace
+    from embomatrix.skills.turns import TurnObservation
     from embomatrix.world.task import Task
 
 NODES_KEPT: Final = 4_000
@@ -33,8 +37,13 @@ class _Node(Generic[T]):
     """Key in the parent's children: the call, or for a start task id and seed."""
     step: Step | None = None
     mark: Mark | None = None
+    """None for a start that was not asked for its mark."""
     ending: tuple[Trace, T] | None = None
     """Trace and judgement of a plan that ends here. Those of other plans differ in the plan alone."""
+    world: WorldMark | None = None
+    """State of the world where the mark lacks it, if a turn has begun here."""
+    turn: tuple[int, TurnObservation, T] | None = None
+    """Prefix, observation and judgement of a turn that ended here."""
     children: dict[_Key, _Node[T]] = field(default_factory=dict)
 
 
@@ -64,31 +73,60 @@ class TransitionTree(Generic[T]):
 
         Equal to ``Simulator.execute`` and a judgement of the final state. ``on_step`` receives the number of finished steps.
         """
-        node = self._start(task, seed)
-        steps: list[Step] = []
-        for call in plan:
-            known = node.children.get(call)
-            if known is None:
-                break
-            node = known
-            steps.append(_step_of(node))
-        shared = len(steps)
-        if shared:
-            on_step(shared)
-        if shared < len(plan) and (not steps or steps[-1].ok):
-            self._go_to(node, task, seed)
-            for call in plan[shared:]:
-                node = self._run(node, call)
-                steps.append(_step_of(node))
-                on_step(len(steps))
-                if not steps[-1].ok:
-                    break
+        nodes, shared = self._walk(task, plan, seed, 0, on_step)
+        node = nodes[-1]
         if node.ending is None:
             self._go_to(node, task, seed)
-            node.ending = self._simulator.trace(task, plan, steps), self._judge(task)
+            node.ending = self._simulator.trace(task, plan, _steps_of(nodes)), self._judge(task)
         self._use(node)
         trace, judgement = node.ending
         return replace(trace, plan=plan), judgement, shared
+
+    def execute_turn(
+        self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> tuple[TurnRun, T]:
+        """Return the run of a turn whose first ``prefix`` calls are its episode's past, and the judgement of its end.
+
+        Equal to ``Simulator.execute_turn`` and a judgement of the final state.
+        """
+        self._mark_of(
+            self._start(task, seed), task, seed
+        )  # while the simulator is there, if it must go there
+        nodes, _ = self._walk(task, plan, seed, prefix, on_step)
+        begin, end = nodes[prefix], nodes[-1]
+        if end.turn is None or end.turn[0] != prefix:
+            before = self._world_at(begin, task, seed)
+            self._go_to(end, task, seed)
+            end.turn = prefix, self._simulator.observe(task, before), self._judge(task)
+        _, observation, judgement = end.turn
+        first, last = self._mark_of(begin, task, seed), self._mark_of(end, task, seed)
+        self._use(end)
+        return TurnRun(_steps_of(nodes), first.digest, last.digest, last.touched, observation), judgement
+
+    def _walk(
+        self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None]
+    ) -> tuple[list[_Node[T]], int]:
+        """Return the nodes from the start to the plan's end, and the number of steps among them that were known.
+
+        The plan ends at its first failure after the ``prefix``.
+        """
+        nodes = [self._start(task, seed)]
+        for call in plan:
+            known = nodes[-1].children.get(call)
+            if known is None or _is_over(nodes, prefix):
+                break
+            nodes.append(known)
+        shared = len(nodes) - 1
+        if shared:
+            on_step(shared)
+        if shared < len(plan) and not _is_over(nodes, prefix):
+            self._go_to(nodes[-1], task, seed)
+            for call in plan[shared:]:
+                nodes.append(self._run(nodes[-1], call))
+                on_step(len(nodes) - 1)
+                if _is_over(nodes, prefix):
+                    break
+        return nodes, shared
 
     def _start(self, task: Task, seed: int) -> _Node[T]:
         key = (task.task_id, seed)
@@ -99,10 +137,28 @@ class TransitionTree(Generic[T]):
 
     def _run(self, node: _Node[T], call: SkillCall) -> _Node[T]:
         """Execute a call at the simulator's present node."""
-        step = self._simulator.run_step(call)
-        child = node.children[call] = _Node(node, call, step, self._simulator.mark())
+        simulator = self._simulator
+        step = simulator.run_step(call)
+        before = None if step.ok else node.mark
+        mark = simulator.mark() if before is None else simulator.mark_after_failure(before)
+        child = node.children[call] = _Node(node, call, step, mark)
         self._here = child
         return child
+
+    def _mark_of(self, node: _Node[T], task: Task, seed: int) -> Mark:
+        if node.mark is None:
+            self._go_to(node, task, seed)
+            node.mark = self._simulator.mark()
+        return node.mark
+
+    def _world_at(self, node: _Node[T], task: Task, seed: int) -> WorldMark:
+        mark = self._mark_of(node, task, seed)
+        if mark.world is not None:
+            return mark.world
+        if node.world is None:
+            self._go_to(node, task, seed)
+            node.world = self._simulator.world.mark()
+        return node.world
 
     def _go_to(self, node: _Node[T], task: Task, seed: int) -> None:
         """Bring the simulator to the state of a node."""
@@ -128,6 +184,11 @@ class TransitionTree(Generic[T]):
             del oldest.parent.children[oldest.key]
 
 
-def _step_of(node: _Node[T]) -> Step:
-    assert node.step is not None
-    return node.step
+def _is_over(nodes: list[_Node[T]], prefix: int) -> bool:
+    """Return whether the last node's call failed after the prefix."""
+    step = nodes[-1].step
+    return step is not None and not step.ok and len(nodes) - 1 > prefix
+
+
+def _steps_of(nodes: list[_Node[T]]) -> tuple[Step, ...]:
+    return tuple(node.step for node in nodes if node.step is not None)

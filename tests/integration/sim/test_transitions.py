@@ -1,13 +1,17 @@
-"""Plans executed through a tree of transitions have the results of plain execution."""
+"""Plans and turns executed through a tree of transitions have the results of plain execution."""
+
+import contextlib
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fakes.household import household_scene
 from tests.fakes.plans import plan_of, task_over
+from tests.fakes.scenes import kitchen_scene
 from tests.integration.sim.test_household import CALLS
 
 from embomatrix.reward.hierarchy import score
+from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.transitions import TransitionTree
 from embomatrix.world.bundle import Bundle
@@ -88,3 +92,89 @@ def test_tree_forgets_what_was_not_used_for_longest(home, task):
         tree.execute(task, new, seed)
     assert len(tree) == 6
     assert tree.execute(task, old, 0)[2] == 0
+
+
+def plain_turn(simulator, task, plan, seed, prefix):
+    run = simulator.execute_turn(task, plan, seed, prefix)
+    return run, score(task, run.touched, simulator.facts)
+
+
+def call_alone(simulator, task, plan, seed):
+    """Return what a client sees that executes the calls one by one: the steps, and the digest after each."""
+    simulator.reset(task, seed)
+    return [(simulator.run_step(call), simulator.mark().digest) for call in plan]
+
+
+@settings(max_examples=60, deadline=None)
+@given(PLANS, st.integers(1, 12), st.data())
+def test_turns_through_a_tree_of_any_size_equal_plain_ones(home, texts, most, data):
+    task = task_over(home[0].world.scene, GOAL)
+    tree = tree_of(home[0], most)
+    for plan in plans_of(task, texts):
+        seed = data.draw(st.integers(0, 1))
+        alone = call_alone(home[1], task, plan, seed)
+        prefix = 0
+        while prefix < len(plan):
+            end = data.draw(st.integers(prefix + 1, len(plan)))
+            run, judged = tree.execute_turn(task, plan[:end], seed, prefix)
+            assert (run, judged) == plain_turn(home[1], task, plan[:end], seed, prefix)
+            assert list(run.steps) == [step for step, _ in alone[: len(run.steps)]]
+            assert run.digest == alone[len(run.steps) - 1][1]
+            assert all(step.ok for step in run.steps[prefix:-1])
+            # A plan that ends at its first failure shares the tree with turns that go on after it.
+            trace, judged, _ = tree.execute(task, plan, seed)
+            assert (trace, judged) == plain(home[1], task, plan, seed)
+            prefix = len(run.steps)
+
+
+def test_failed_call_shares_the_state_of_the_world_before_it(home, task):
+    simulator = home[0]
+    simulator.reset(task, 0)
+    for call in plan_of(task, "move rag_1; place sink_1 inside; pick_up rag_1; open rag_1; pick_up plate_2"):
+        before = simulator.mark()
+        if not simulator.run_step(call).ok:
+            assert simulator.mark().world == before.world
+            shared = simulator.mark_after_failure(before)
+            assert shared.world is before.world
+            assert shared.digest == simulator.mark().digest != before.digest
+
+
+def test_turn_after_a_failure_draws_what_it_would_draw_without_it(home, task):
+    tree = tree_of(home[0])
+    good, failed = plans_of(task, ["move rag_1; pick_up rag_1; move sink_1", "place sink_1 inside"])
+    put = plan_of(task, "place sink_1 inside")
+    with_failure, _ = tree.execute_turn(task, (*failed, *good, *put), 0, 4)
+    without, _ = tree.execute_turn(task, (*good, *put), 0, 3)
+    assert [step.ok for step in with_failure.steps] == [False, True, True, True, True]
+    assert with_failure.steps[1:] == without.steps
+    assert with_failure.observation == without.observation
+    assert with_failure.digest != without.digest
+
+
+def test_observation_says_what_changed_and_what_the_robot_holds(home, task):
+    tree = tree_of(home[0])
+    (plan,) = plans_of(task, ["move rag_1; pick_up rag_1"])
+    first, _ = tree.execute_turn(task, plan[:1], 0, 0)
+    second, _ = tree.execute_turn(task, plan, 0, 1)
+    assert (first.observation.held, first.observation.changes) == ((), ())
+    assert second.observation.held == ("rag_1",)
+    assert second.observation.changes == ("rag_1: in the robot's hand",)
+    assert second.observation.room == home[0].world.robot_room
+    assert second.prefix_digest == first.digest
+
+
+def test_turns_in_physical_mode_equal_plain_ones():
+    scene = kitchen_scene()
+    task = task_over(scene)
+    plan = plan_of(
+        task, "move apple_1; pick_up apple_1; pick_up mug_1; move countertop_1; place countertop_1 ontop"
+    )
+    with (
+        contextlib.closing(physical_simulator(Bundle(scene, {}))) as shared,
+        contextlib.closing(physical_simulator(Bundle(scene, {}))) as alone,
+    ):
+        tree = TransitionTree(shared, lambda task: score(task, shared.touched, shared.facts))
+        for prefix, end in ((0, 2), (2, 3), (3, 5), (2, 3), (3, 4)):
+            run, judged = tree.execute_turn(task, plan[:end], 5, prefix)
+            assert (run, judged) == plain_turn(alone, task, plan[:end], 5, prefix)
+        assert [step.ok for step in run.steps] == [True, True, False, True]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.fakes.worker import completed
+from tests.fakes.worker import completed, completed_turn
 
 from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.commands import CancelLease, DeliverResult, GiveLease, QuarantineWorker
@@ -40,7 +40,10 @@ from embomatrix.rpc.wire.values import (
     Rollout,
     RunTerms,
 )
+from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.turns import EpisodePrefix
 
+CALL = SkillCall(Skill.MOVE, object_index=1)
 SAME = {"platform": "a1", "pybullet": "3.2.7"}
 OTHER = {"platform": "b2", "pybullet": "3.2.7"}
 VERIFIED = RunTerms(GroupPolicy.PARTIAL, verified=True)
@@ -408,3 +411,30 @@ def test_two_checks_of_one_rollout_in_one_queue_have_an_order():
     bench.join("w3")
     bench.answer(lies={"w2"})
     assert len(bench.results) == 2
+
+
+def submit_turn(bench):
+    turn = Rollout("t", "t", "kitchen", "t", (CALL, CALL), 0, prefix=EpisodePrefix(1, (), "sha256:a"))
+    bench.apply(BatchSubmitted(Batch("r1", "b1", 0, (turn,))))
+    return turn
+
+
+def test_turn_is_checked_by_a_worker_of_the_same_platform():
+    bench = Bench(workers=("w1", "w2"))
+    turn = submit_turn(bench)
+    bench.join("other", OTHER)
+    first = bench.only_lease()
+    bench.finish(first, completed_turn(turn, first.worker_id))
+    second = bench.only_lease()
+    assert {first.worker_id, second.worker_id} == {"w1", "w2"}
+    bench.finish(second, completed_turn(turn, second.worker_id))
+    assert isinstance(bench.results["t"].outcome, Completed)
+
+
+def test_turn_without_a_second_worker_of_its_platform_is_not_checked():
+    bench = Bench(workers=("w1",))
+    turn = submit_turn(bench)
+    bench.join("other", OTHER)
+    bench.finish(bench.only_lease(), completed_turn(turn, "w1"))
+    assert isinstance(bench.results["t"].outcome, Completed)
+    assert bench.stats().audited == 0

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.fakes.worker import completed
+from tests.fakes.worker import completed, completed_turn
 
 from embomatrix.manager.control.plausibility import contradiction
 from embomatrix.reward.breakdown import AtomResult
@@ -14,6 +14,7 @@ from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.skills.trace import Step
+from embomatrix.skills.turns import EpisodePrefix
 
 PLAN = (SkillCall(Skill.MOVE, object_index=3), SkillCall(Skill.OPEN, object_index=4))
 ROLLOUT = Rollout("x1", "g", "kitchen", "t", PLAN, 1)
@@ -76,3 +77,37 @@ def test_every_reward_that_can_be_computed_is_accepted(settings, holds, objects)
     plan = tuple(SkillCall(Skill.MOVE, object_index=index) for index in objects)
     result = completed(reward=settings, plan=plan, holds=tuple(holds))
     assert contradiction(result, dataclasses.replace(ROLLOUT, plan=plan), settings) == ""
+
+
+TURN = dataclasses.replace(ROLLOUT, plan=(*PLAN, *PLAN), prefix=EpisodePrefix(2, (1,), "sha256:a"))
+
+
+def test_honest_turn_reports_the_steps_after_its_prefix():
+    assert contradiction(completed_turn(TURN), TURN, PAPER) == ""
+
+
+def test_prefix_that_failed_earns_no_relevance():
+    first = dataclasses.replace(TURN, plan=PLAN, prefix=EpisodePrefix(1, (0,)))
+    honest = completed_turn(first)
+    assert honest.reward.relevance == 0.2
+    high = dataclasses.replace(honest, reward=dataclasses.replace(honest.reward, relevance=0.4))
+    assert "no number of touched objects" in contradiction(high, first, PAPER)
+    succeeded = dataclasses.replace(first, prefix=EpisodePrefix(1))
+    assert contradiction(high, succeeded, PAPER) == ""
+
+
+@pytest.mark.parametrize(
+    ("result", "turn", "reason"),
+    [
+        (completed(plan=TURN.plan), TURN, "no observation"),
+        (completed_turn(TURN), dataclasses.replace(TURN, prefix=None), "its rollout is no turn"),
+        (
+            dataclasses.replace(completed_turn(TURN), steps=completed(plan=TURN.plan).steps),
+            TURN,
+            "4 steps for a plan of 2 calls",
+        ),
+        (dataclasses.replace(completed_turn(TURN), steps=()), TURN, "ends after 0 of 2"),
+    ],
+)
+def test_impossible_turn_is_named(result, turn, reason):
+    assert reason in contradiction(result, turn, PAPER)

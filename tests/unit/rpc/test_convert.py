@@ -37,6 +37,7 @@ from embomatrix.rpc.wire.values import (
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
+from embomatrix.skills.turns import EpisodePrefix, TurnObservation
 
 NEWER = bytes.fromhex("f80705")
 """Field 127, a varint, as a later version of the protocol may add it to a message."""
@@ -72,6 +73,22 @@ ROLLOUTS = st.builds(
     seed=UINT64,
     render=st.booleans(),
 )
+TURNS = st.builds(
+    lambda rollout, calls, failed, digest: dataclasses.replace(
+        rollout,
+        plan=tuple(calls),
+        prefix=EpisodePrefix(
+            len(calls) - 1, tuple(sorted(index for index in failed if index < len(calls) - 1)), digest
+        ),
+    ),
+    ROLLOUTS,
+    st.lists(CALLS, min_size=1, max_size=5),
+    st.sets(st.integers(0, 4)),
+    TEXTS,
+)
+OBSERVATIONS = st.builds(
+    TurnObservation, TEXTS, st.lists(TEXTS, max_size=3).map(tuple), st.lists(TEXTS, max_size=3).map(tuple)
+)
 REWARDS = st.builds(
     RewardBreakdown,
     NUMBERS,
@@ -90,6 +107,7 @@ COMPLETED = st.builds(
     TEXTS,
     st.builds(Timings, SECONDS, SECONDS, SECONDS),
     st.booleans(),
+    st.none() | OBSERVATIONS,
 )
 FAILURES = st.builds(InfraFailure, st.sampled_from(InfraCode), TEXTS, TEXTS)
 RESULTS = st.builds(
@@ -123,6 +141,52 @@ def test_every_skill_call_round_trips(call):
 def test_batch_round_trips(rollouts, name, step):
     batch = Batch("run-1", name, step, rollouts)
     assert convert.batch_from_proto(_over_the_wire(convert.batch_to_proto(batch))) == batch
+
+
+@given(st.lists(TURNS, min_size=1, max_size=4, unique_by=lambda turn: turn.rollout_id).map(tuple), NAMES)
+def test_turns_round_trip(turns, run_id):
+    message = _over_the_wire(convert.turns_to_proto(run_id, turns))
+    assert message.run_id == run_id
+    came = tuple(map(convert.turn_from_proto, message.turns))
+    assert convert.checked_turns(came) == turns
+    assert all(turn.is_turn for turn in came)
+
+
+@given(TURNS)
+def test_prefix_of_an_unparsed_turn_is_known_at_once(turn):
+    unread = convert.unread_rollout(convert.rollout_to_proto(turn))
+    assert unread.prefix == turn.prefix
+    assert unread == turn
+
+
+CALL = SkillCall(Skill.MOVE, object_index=1)
+
+
+@pytest.mark.parametrize(
+    ("prefix", "calls", "problem"),
+    [
+        (None, 1, "prefix: found no value"),
+        (EpisodePrefix(2), 2, "prefix.length: found 2 of 2 calls: expected fewer"),
+        (EpisodePrefix(0), 0, "prefix.length: found 0 of 0 calls: expected fewer"),
+        (EpisodePrefix(2, (2,)), 3, "prefix.failed: found 2: expected rising indices below 2"),
+        (EpisodePrefix(3, (1, 1)), 4, "prefix.failed: found 1, 1: expected rising indices below 3"),
+        (EpisodePrefix(3, (1, 0)), 4, "prefix.failed: found 1, 0: expected rising indices below 3"),
+        (EpisodePrefix(64), 65, "plan: found 65 elements: expected at most 64"),
+        (EpisodePrefix(65), 64, "prefix.length: found 65: expected 0 to 64"),
+        (EpisodePrefix(1, (), "x" * 4_001), 2, "prefix.digest: found 4,001 characters"),
+    ],
+)
+def test_malformed_prefix_is_named(prefix, calls, problem):
+    turn = convert.rollout_to_proto(Rollout("r", "g", "b", "t", (CALL,) * calls, 0, prefix=prefix))
+    with pytest.raises(ConvertError) as caught:
+        convert.turn_from_proto(turn)
+    assert problem in str(caught.value)
+
+
+def test_repeated_turn_is_named():
+    turn = Rollout("r", "g", "b", "t", (CALL,), 0, prefix=EpisodePrefix())
+    with pytest.raises(ConvertError, match=r"turns\[1\].rollout_id: found 'r' a second time"):
+        convert.checked_turns((turn, turn))
 
 
 @given(RESULTS)

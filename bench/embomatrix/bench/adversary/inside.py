@@ -309,7 +309,7 @@ async def manager_inside(folder: Path) -> AsyncIterator[ManagerInside]:
         WorkerServicer(runtime, gate, lease_ttl_s=30.0), methods
     )
     rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(
-        RolloutServicer(runtime.runs, runtime.training, gate), methods
+        RolloutServicer(runtime.runs, runtime.turns, runtime.training, gate), methods
     )
     scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(bundles), methods)
     admin_service_pb2_grpc.add_AdminServiceServicer_to_server(

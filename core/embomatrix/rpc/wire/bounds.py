@@ -21,6 +21,7 @@ from google.protobuf.message import DecodeError, Message
 from embomatrix.rpc.wire.codec import ConvertError, MessageT
 from embomatrix.skills.syntax import MAX_ROOM_NAME, MAX_STEPS
 from embomatrix.world.evaluate import MAX_ATOMS
+from embomatrix.world.task import MAX_TABLE
 
 LARGEST_EPOCH: Final = 2.0**63
 NAME: Final = 256
@@ -35,6 +36,8 @@ RESULT_TEXT: Final = 4_000
 """Characters of a text in a result. The texts of a result with fewer bytes need no check."""
 MOST_EQUAL: Final = 63
 """Further ids of equal rollouts in one message."""
+TURNS: Final = 256
+"""Turns of one call of ``Step``. All their results fit into one message."""
 DAY_S: Final = 86_400.0
 
 
@@ -130,6 +133,9 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "Completed.trace_digest": _RESULT_TEXT,
     "Completed.worker_id": _RESULT_TEXT,
     "Completed.shared_steps": _COUNT,
+    "TurnObservation.room": _RESULT_TEXT,
+    "TurnObservation.held": Bound(length=RESULT_TEXT, count=HELD_LEASES),
+    "TurnObservation.changes": Bound(length=RESULT_TEXT, count=MAX_TABLE + 1),
     "Reward.format": _REWARD,
     "Reward.relevance": _REWARD,
     "Reward.goal": _REWARD,
@@ -194,6 +200,11 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "Rollout.plan": Bound(count=MAX_STEPS),
     "Rollout.seed": _numbers(2.0**64),
     "Rollout.also": Bound(length=NAME, count=MOST_EQUAL),
+    "EpisodePrefix.length": _numbers(MAX_STEPS),
+    "EpisodePrefix.failed": Bound(count=MAX_STEPS),
+    "EpisodePrefix.digest": _RESULT_TEXT,
+    "StepRequest.run_id": _ID,
+    "StepRequest.turns": Bound(count=TURNS),
     "WaitExecutionRequest.run_id": _ID,
     "WaitExecutionRequest.batch_id": _ID,
     "WaitExecutionRequest.after_cursor": _EPOCH,
@@ -240,6 +251,7 @@ BOUNDS: Final[Mapping[str, Bound]] = {
 MESSAGE_BYTES: Final[Mapping[str, int]] = {
     "SessionRequest": 4 * 1024 * 1024,
     "ExecuteRequest": 32 * 1024 * 1024,
+    "StepRequest": 8 * 1024 * 1024,
     "PutBundleRequest": 5 * 1024 * 1024,
     "AnnounceLookaheadRequest": 4 * 1024 * 1024,
     "MissingBundlesRequest": 8 * 1024 * 1024,
@@ -255,6 +267,7 @@ CONVERTED_LATER: Final = frozenset(
         "SessionRequest.results",
         "WorkerState.finished",
         "ExecuteRequest.rollouts",
+        "StepRequest.turns",
         "Completed.steps",
         "Rollout.plan",
     }

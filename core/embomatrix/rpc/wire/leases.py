@@ -49,7 +49,7 @@ class Lease:
 class LeaseResult:
     """Result of a lease, which ran in ``slot`` (from 1; 0: never) for ``held_s`` seconds.
 
-    ``origin`` stays on the worker and travels in its claims.
+    ``origin`` stays on the worker and travels in its claims; ``awaited`` stays there too.
     """
 
     ref: LeaseRef
@@ -57,6 +57,8 @@ class LeaseResult:
     origin: LeaseOrigin | None = None
     slot: int = 0
     held_s: float = 0.0
+    awaited: bool = False
+    """A client waits for it, as for every turn of an episode, so it is sent at once."""
 
 
 @dataclass(frozen=True, slots=True)

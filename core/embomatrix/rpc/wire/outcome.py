@@ -27,12 +27,14 @@ from embomatrix.rpc.wire.values import (
 )
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.trace import Step
+from embomatrix.skills.turns import TurnObservation
 
 reward_to_proto, reward_from_proto = converters(
     RewardBreakdown,
     types_pb2.Reward,
     parts={"atoms": converters(AtomResult, types_pb2.AtomResult)},
 )
+_observation_to_proto, _observation_from_proto = converters(TurnObservation, types_pb2.TurnObservation)
 infra_failure_to_proto, infra_failure_from_proto = converters(
     InfraFailure,
     types_pb2.InfraFailure,
@@ -93,6 +95,9 @@ def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
         message.final_state.extend(completed.final)
         message.trace_digest = completed.trace_digest
         message.shared_steps = completed.shared_steps
+        if completed.observation is not None:
+            message.observation.SetInParent()
+            message.observation.MergeFrom(_observation_to_proto(completed.observation))
     message.worker_id = completed.worker_id
     message.timings.SetInParent()
     _write_timings(completed.timings, message.timings)
@@ -114,13 +119,14 @@ def completed_from_proto(message: types_pb2.Completed) -> Completed:
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
         shared_steps=message.shared_steps,
+        observation=_observation_in(message),
     )
     object.__setattr__(completed, "wire", wire)
     return completed
 
 
 def checked_completed(message: types_pb2.Completed) -> Completed:
-    """Return the result after the same checks, with reward and steps. The first access to another value parses it."""
+    """Return the result after the same checks. Texts of the final state and the digest are parsed on first access."""
     reward = inside("reward", reward_from_proto, _reward_in(message))
     wire = message.SerializeToString()
     return Completed.unread(
@@ -132,7 +138,12 @@ def checked_completed(message: types_pb2.Completed) -> Completed:
         warm=message.warm,
         worker_id=message.worker_id,
         shared_steps=message.shared_steps,
+        observation=_observation_in(message),
     )
+
+
+def _observation_in(message: types_pb2.Completed) -> TurnObservation | None:
+    return _observation_from_proto(message.observation) if message.HasField("observation") else None
 
 
 def _steps_in(wire: bytes) -> tuple[Step, ...]:

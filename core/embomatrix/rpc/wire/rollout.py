@@ -1,18 +1,21 @@
-"""Conversion of plans, rollouts and batches to and from protobuf."""
+"""Conversion of plans, rollouts, turns and batches to and from protobuf."""
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, Literal
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
-from embomatrix.rpc.wire.bounds import MOST_EQUAL, check
+from embomatrix.rpc.wire.bounds import MOST_EQUAL, TURNS, check
 from embomatrix.rpc.wire.codec import (
     ConvertError,
+    converters,
     each,
     each_known,
     enum_numbers,
     finite,
+    inside,
     maker,
     required,
     through,
@@ -29,6 +32,7 @@ from embomatrix.skills.syntax import (
     Skill,
     SkillCall,
 )
+from embomatrix.skills.turns import EpisodePrefix
 
 ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
 
@@ -111,6 +115,9 @@ def _plan_from(calls: Sequence[bytes]) -> Plan:
     return each_known("plan", _call_of, calls)
 
 
+_prefix_to_proto, _prefix_from_proto = converters(EpisodePrefix, types_pb2.EpisodePrefix)
+
+
 def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     """Fill an empty message. A rollout that was received is written with its original bytes."""
     if rollout.wire:
@@ -124,6 +131,9 @@ def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     message.seed = rollout.seed
     message.render = rollout.render
     message.also.extend(rollout.also)
+    if rollout.prefix is not None:
+        message.prefix.SetInParent()
+        message.prefix.MergeFrom(_prefix_to_proto(rollout.prefix))
 
 
 rollout_to_proto = maker(types_pb2.Rollout, write_rollout)
@@ -146,7 +156,9 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         seed=message.seed,
         render=message.render,
         also=tuple(message.also),
+        prefix=_prefix_in(message),
     )
+    _check_prefix(rollout)
     object.__setattr__(rollout, "wire", wire)
     return rollout
 
@@ -157,7 +169,29 @@ def unread_rollout(message: types_pb2.Rollout) -> Rollout:
         message.SerializeToString(),
         _read_rollout,
         bundle_digest=required("bundle_digest", message.bundle_digest),
+        prefix=_prefix_in(message),
     )
+
+
+def _prefix_in(message: types_pb2.Rollout) -> EpisodePrefix | None:
+    return inside("prefix", _prefix_from_proto, message.prefix) if message.HasField("prefix") else None
+
+
+def _check_prefix(rollout: Rollout) -> None:
+    """Raise ConvertError for a prefix that is not a part of the plan."""
+    prefix = rollout.prefix
+    if prefix is None:
+        return
+    if prefix.length >= len(rollout.plan):
+        raise ConvertError(
+            "prefix.length",
+            f"found {prefix.length} of {len(rollout.plan)} calls: expected fewer, since a turn has a new call",
+        )
+    if any(index >= after for index, after in itertools.pairwise((*prefix.failed, prefix.length))):
+        raise ConvertError(
+            "prefix.failed",
+            f"found {', '.join(map(str, prefix.failed[:MAX_STEPS]))}: expected rising indices below {prefix.length}",
+        )
 
 
 def _read_rollout(wire: bytes) -> Rollout:
@@ -204,17 +238,42 @@ def batch_from_proto(message: rollout_service_pb2.ExecuteRequest) -> Batch:
 
 def batch_with(message: rollout_service_pb2.ExecuteRequest, rollouts: tuple[Rollout, ...]) -> Batch:
     """Return the batch of a message whose rollouts are converted already."""
-    seen: set[str] = set()
-    for index, rollout in enumerate(rollouts):
-        for rollout_id in (rollout.rollout_id, *rollout.also):
-            if rollout_id in seen:
-                raise ConvertError(
-                    f"rollouts[{index}].rollout_id",
-                    f"found {rollout_id!r} a second time: expected unique ids",
-                )
-            seen.add(required(f"rollouts[{index}].also", rollout_id))
+    _check_unique("rollouts", rollouts)
     batch = Batch(
         required("run_id", message.run_id), required("batch_id", message.batch_id), message.step, rollouts
     )
     object.__setattr__(batch, "wire", message.SerializeToString(deterministic=True))
     return batch
+
+
+def _check_unique(field: str, rollouts: Sequence[Rollout]) -> None:
+    seen: set[str] = set()
+    for index, rollout in enumerate(rollouts):
+        for rollout_id in (rollout.rollout_id, *rollout.also):
+            if rollout_id in seen:
+                raise ConvertError(
+                    f"{field}[{index}].rollout_id", f"found {rollout_id!r} a second time: expected unique ids"
+                )
+            seen.add(required(f"{field}[{index}].also", rollout_id))
+
+
+def turns_to_proto(run_id: str, turns: Sequence[Rollout]) -> rollout_service_pb2.StepRequest:
+    message = rollout_service_pb2.StepRequest(run_id=run_id)
+    for turn in turns:
+        write_rollout(turn, message.turns.add())
+    return message
+
+
+def turn_from_proto(message: types_pb2.Rollout) -> Rollout:
+    """Return the rollout of a turn. Raise ConvertError for one without a prefix."""
+    if not message.HasField("prefix"):
+        raise ConvertError("prefix", "found no value: a turn has one; submit other rollouts with Execute")
+    return rollout_from_proto(message)
+
+
+def checked_turns(turns: tuple[Rollout, ...]) -> tuple[Rollout, ...]:
+    """Return the turns of one request. Raise ConvertError for none, and for a repeated id: each turn gets one result."""
+    if not turns:
+        raise ConvertError("turns", f"found none: expected 1 to {TURNS}")
+    _check_unique("turns", turns)
+    return turns

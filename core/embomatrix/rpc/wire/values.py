@@ -15,6 +15,7 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Step
+from embomatrix.skills.turns import EpisodePrefix, TurnObservation
 
 Reader = Callable[[bytes], object]
 
@@ -52,7 +53,7 @@ class _ReadWhenAsked:
 class Rollout(_ReadWhenAsked):
     """One plan to execute once. The plans of one task in one batch share ``group_id`` and ``seed``."""
 
-    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render", "also"})
+    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render", "also", "prefix"})
 
     rollout_id: str
     group_id: str
@@ -64,6 +65,8 @@ class Rollout(_ReadWhenAsked):
     """Needs a slot that renders on a GPU."""
     also: tuple[str, ...] = ()
     """Ids of further rollouts of the group that are equal in everything else: one execution serves all."""
+    prefix: EpisodePrefix | None = None
+    """Calls of the plan that its episode has made before, if this is a turn of an episode."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on unchanged; a modified copy has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
@@ -73,6 +76,10 @@ class Rollout(_ReadWhenAsked):
     def count(self) -> int:
         """Number of rollouts that this one stands for."""
         return 1 + len(self.also)
+
+    @property
+    def is_turn(self) -> bool:
+        return self.prefix is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +97,11 @@ class Batch:
     def count(self) -> int:
         """Number of rollouts."""
         return sum(rollout.count for rollout in self.rollouts)
+
+    @property
+    def has_turns(self) -> bool:
+        """True if its rollouts are turns of episodes: then all are."""
+        return bool(self.rollouts) and self.rollouts[0].is_turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +124,7 @@ class Timings:
 class Completed(_ReadWhenAsked):
     """Executed and scored plan: evidence about the policy, with any reward."""
 
-    _left = frozenset({"reward", "steps", "final", "trace_digest", "shared_steps"})
+    _left = frozenset({"reward", "steps", "final", "trace_digest", "shared_steps", "observation"})
 
     reward: RewardBreakdown
     steps: tuple[Step, ...]
@@ -123,6 +135,8 @@ class Completed(_ReadWhenAsked):
     warm: bool
     shared_steps: int = field(default=0, compare=False)
     """Steps that were known from earlier rollouts and not executed. Equal plans may differ in it."""
+    observation: TurnObservation | None = None
+    """Observation of a turn, whose ``steps`` are those after its prefix."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on with the ``noted`` fields replaced; a copy with other changes has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
@@ -146,6 +160,7 @@ class Completed(_ReadWhenAsked):
             timings,
             warm,
             self.shared_steps,
+            self.observation,
         )
         object.__setattr__(copy, "wire", self.wire)
         return copy
@@ -167,6 +182,7 @@ class InfraCode(StrEnum):
     SLOT_OOM = "slot_oom"
     VERSION_SKEW = "version_skew"
     RESULT_MISMATCH = "result_mismatch"
+    PREFIX_MISMATCH = "prefix_mismatch"
 
 
 @dataclass(frozen=True, slots=True)

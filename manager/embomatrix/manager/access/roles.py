@@ -17,7 +17,7 @@ _GRANTS: Final = (
     ("WorkerService", _WORKER, ("Session", "Heartbeat", "FetchBundle", "Deregister")),
     ("RolloutService", frozenset(AccessRole), ("GetCapabilities",)),
     ("RolloutService", _TRAINER, ("OpenRun", "AnnounceLookahead", "Execute", "WaitExecution")),
-    ("RolloutService", _TRAINER, ("CancelBatch", "ReportTraining", "CloseRun")),
+    ("RolloutService", _TRAINER, ("CancelBatch", "Step", "ReportTraining", "CloseRun")),
     ("SceneService", _TRAINER, ("MissingBundles", "PutBundle", "GetBundle")),
     ("AdminService", _VIEWER, ("ListWorkers", "ListRuns", "GetPlan", "GetRun")),
     ("AdminService", _VIEWER, ("ReadEvents", "ExplainRollout")),

@@ -6,6 +6,7 @@ It needs no simulator: a result that fails it contradicts itself, whatever the s
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.wire.values import Completed, Rollout
+from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Step
 
 
@@ -13,13 +14,27 @@ def contradiction(completed: Completed, rollout: Rollout, settings: RewardSettin
     """Return the reason why no execution of the plan can have this result; empty if one can."""
     if completed.shared_steps > len(completed.steps):
         return f"it shares {completed.shared_steps} of its {len(completed.steps)} steps"
-    return _wrong_steps(completed.steps, rollout) or _wrong_reward(
-        completed.reward, completed.steps, settings
+    prefix = rollout.prefix
+    if (completed.observation is None) != (prefix is None):
+        return (
+            "it has an observation, and its rollout is no turn" if prefix is None else "it has no observation"
+        )
+    before, plan = _split(rollout)
+    return _wrong_steps(completed.steps, plan) or _wrong_reward(
+        completed.reward, (*before, *(step.call for step in completed.steps if step.ok)), settings
     )
 
 
-def _wrong_steps(steps: tuple[Step, ...], rollout: Rollout) -> str:
-    plan = rollout.plan
+def _split(rollout: Rollout) -> tuple[Plan, Plan]:
+    """Return the calls of the prefix that succeeded, and the calls after the prefix."""
+    prefix = rollout.prefix
+    if prefix is None:
+        return (), rollout.plan
+    done = (call for index, call in enumerate(rollout.plan[: prefix.length]) if index not in prefix.failed)
+    return tuple(done), rollout.plan[prefix.length :]
+
+
+def _wrong_steps(steps: tuple[Step, ...], plan: Plan) -> str:
     if len(steps) > len(plan):
         return f"it has {len(steps)} steps for a plan of {len(plan)} calls"
     if tuple([step.call for step in steps]) != plan[: len(steps)]:
@@ -32,7 +47,7 @@ def _wrong_steps(steps: tuple[Step, ...], rollout: Rollout) -> str:
     return ""
 
 
-def _wrong_reward(reward: RewardBreakdown, steps: tuple[Step, ...], settings: RewardSettings) -> str:
+def _wrong_reward(reward: RewardBreakdown, done: Plan, settings: RewardSettings) -> str:
     """Recompute the tiers as `embomatrix.reward.hierarchy.score` does, to the bit."""
     satisfied = sum(atom.holds for atom in reward.atoms)
     goal = settings.goal * satisfied / len(reward.atoms) if reward.atoms else 0.0
@@ -43,21 +58,20 @@ def _wrong_reward(reward: RewardBreakdown, steps: tuple[Step, ...], settings: Re
     if reward.success != (0 < len(reward.atoms) == satisfied):
         said = "succeeds" if reward.success else "fails"
         return f"it {said}, and {satisfied} of its {len(reward.atoms)} atoms hold"
-    return "" if _is_relevance(reward.relevance, steps, settings) else _irrelevant(reward.relevance)
+    return "" if _is_relevance(reward.relevance, done, settings) else _irrelevant(reward.relevance)
 
 
 def _irrelevant(relevance: float) -> str:
     return f"no number of touched objects earns its relevance reward of {relevance:g}"
 
 
-def _is_relevance(relevance: float, steps: tuple[Step, ...], settings: RewardSettings) -> bool:
+def _is_relevance(relevance: float, done: Plan, settings: RewardSettings) -> bool:
     """True if some of the objects that successful calls can have touched earn this relevance reward.
 
     A call touches its target and its source. Calls without an index act on the held object.
     """
     if relevance == 0.0:
         return True
-    done = [step.call for step in steps if step.failure is None]
     named = {call.object_index for call in done} | {call.source_index for call in done}
     most = len(named - {None})
     return any(

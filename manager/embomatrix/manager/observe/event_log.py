@@ -20,7 +20,15 @@ from embomatrix.manager.observe.run_figures import RunFigures
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.run_log import EventKind, EventPage, RolloutPhase, RunEvent
-from embomatrix.rpc.wire.values import Batch, Completed, InfraFailure, Resident, ResidentState, Resources
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Completed,
+    InfraCode,
+    InfraFailure,
+    Resident,
+    ResidentState,
+    Resources,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -231,6 +239,8 @@ class RunEventLog:
             code, message = result.outcome.code.value, result.outcome.message[:MESSAGE_CHARS]
             worker.failed += 1
         self._hedges.pop(result.ref.lease_id, None)
+        if record.rollout.is_turn and code in ("", InfraCode.PREFIX_MISMATCH):
+            return  # its client has the answer, and thousands of turns a second would displace all other events
         event = RunEvent(
             next(self._sequences),
             self.epoch_s + now_s,

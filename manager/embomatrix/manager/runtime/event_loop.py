@@ -28,6 +28,7 @@ from embomatrix.manager.observe.run_archive import RunArchive, RunHistory
 from embomatrix.manager.observe.training_reports import TrainingBook
 from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
+from embomatrix.manager.runtime.open_turns import OpenTurns
 from embomatrix.manager.runtime.registry import Registry, WorkerSession, WorkerStanding
 from embomatrix.manager.runtime.results import ResultDelivery, ResultLogs
 from embomatrix.manager.runtime.runs import Runs
@@ -88,6 +89,7 @@ class ManagerRuntime:
         self.event_log = RunEventLog(epoch_s=time.time() - self.started_s)
         self.history = RunHistory(self.event_log, archive, cluster)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, self.history)
+        self.turns = OpenTurns(self.runs, self._feed)
         self._intake = Intake(cluster, registry)
         self._journal = StateJournal(store, registry, cluster)
         self._delivery = ResultDelivery(store, logs, self._send, self.event_log.count_deliveries)
@@ -257,8 +259,7 @@ class ManagerRuntime:
         await self._journal.note_pause(paused)
 
     def _update_dispatch(self) -> None:
-        event = PauseChanged(self.paused or self._suspended)
-        self._carry_out(self.cluster.handle(event, now_s=time.monotonic()))
+        self._feed(PauseChanged(self.paused or self._suspended))
 
     def _carry_out(self, commands: Sequence[ManagerCommand], *, more: bool = False) -> None:
         now_s = time.monotonic()
@@ -271,21 +272,26 @@ class ManagerRuntime:
                     self._send(command)
                 case GiveLease():
                     self._send(command)
-                    if not command.audit:
+                    if not (command.audit or command.rollout.is_turn):
                         self.event_log.leased(command, now_s=now_s)
                 case AcknowledgeLease():
                     self._delivery.put_acknowledgement(command)
                 case DeliverResult():
                     self.meter.observe(command.run_id, command.result, now_s)
                     self.event_log.delivered(command, now_s=now_s)
-                    self._delivery.put(command)
+                    if not self.turns.take(command):
+                        self._delivery.put(command)
                 case FinishBatch():
-                    self._delivery.put(command)
+                    if not self.turns.take(command):
+                        self._delivery.put(command)
                 case QuarantineWorker():
                     logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
                     self._journal.flush()
         if not more:
             self._delivery.flush()
+
+    def _feed(self, event: Event) -> None:
+        self._carry_out(self.cluster.handle(event, now_s=time.monotonic()))
 
     def _send(self, command: WorkerCommand) -> None:
         """Send a command. Without a stream the command is lost; the worker's next full state shows that, and it is

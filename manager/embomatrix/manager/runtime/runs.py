@@ -205,6 +205,8 @@ class Runs:
             if log.digest != row.digest:
                 raise taken
             return self.log_of(batch.run_id, batch.batch_id)
+        if any(rollout.is_turn for rollout in batch.rollouts):
+            raise InvalidRequestError(f"batch {batch.batch_id!r} has turns of episodes: send them with Step")
         self._check_batch(batch)
         check_plans(batch, profiles)
         log = BatchLog(batch.run_id, batch.batch_id, row.digest, groups=group_sizes(batch))
@@ -221,6 +223,18 @@ class Runs:
         self._history.submitted(batch)
         self._submissions.enter(batch)
         return log
+
+    async def check_turns(self, batch: Batch) -> None:
+        """Raise the error of ``submit`` if these turns can't be executed."""
+        self.touch(batch.run_id)
+        profiles = await self._bundles.profiles(rollout.bundle_digest for rollout in batch.rollouts)
+        self.touch(batch.run_id)
+        self._check_batch(batch)
+        check_plans(batch, profiles)
+
+    def enter(self, batch: Batch) -> None:
+        """Queue a batch of turns that was checked. Neither the store nor a result log knows it."""
+        self._submissions.enter(batch)
 
     def log_of(self, run_id: str, batch_id: str) -> BatchLog:
         """Return the result log of a submitted batch. Raises NotFoundError."""
@@ -267,15 +281,11 @@ class Runs:
         return self._runs[run_id]
 
     def _check_batch(self, batch: Batch) -> None:
-        count = batch.count
+        count, name = batch.count, _name(batch)
         if not 0 < count <= BATCH_ROLLOUTS:
-            raise InvalidRequestError(
-                f"batch {batch.batch_id!r} has {count} rollouts: expected 1 to {BATCH_ROLLOUTS}"
-            )
+            raise InvalidRequestError(f"{name} has {count} rollouts: expected 1 to {BATCH_ROLLOUTS}")
         if len({name for rollout in batch.rollouts for name in (rollout.rollout_id, *rollout.also)}) < count:
-            raise InvalidRequestError(
-                f"batch {batch.batch_id!r} has a rollout id twice: every id must be unique"
-            )
+            raise InvalidRequestError(f"{name} has a rollout id twice: every id must be unique")
         queued = self._cluster.dispatcher.queued
         if queued + count > QUEUED_ROLLOUTS:
             raise OverloadedError(
@@ -284,14 +294,13 @@ class Runs:
         scenes = len({rollout.bundle_digest for rollout in batch.rollouts})
         if scenes + self._cluster.dispatcher.waiting_scenes > QUEUED_SCENES:
             raise OverloadedError(
-                f"batch {batch.batch_id!r} has {scenes} scenes beside {self._cluster.dispatcher.waiting_scenes} that wait: "
+                f"{name} has {scenes} scenes beside {self._cluster.dispatcher.waiting_scenes} that wait: "
                 f"at most {QUEUED_SCENES} may; submit fewer at once"
             )
         missing = self._bundles.missing([rollout.bundle_digest for rollout in batch.rollouts])
         if missing:
             raise PreconditionError(
-                f"the manager lacks {len(missing)} bundles of batch {batch.batch_id!r}, first {missing[0]}: "
-                f"upload them first"
+                f"the manager lacks {len(missing)} bundles of {name}, first {missing[0]}: upload them first"
             )
 
     def _feed(self, event: Event) -> None:
@@ -307,7 +316,7 @@ def check_plans(batch: Batch, profiles: Mapping[str, Mapping[str, Profile]]) -> 
         tasks = profiles.get(rollout.bundle_digest)
         if tasks is None:
             continue
-        name = f"rollout {rollout.rollout_id!r} of batch {batch.batch_id!r}"
+        name = f"{'turn' if rollout.is_turn else 'rollout'} {rollout.rollout_id!r} of {_name(batch)}"
         profile = tasks.get(rollout.task_id)
         if profile is None:
             raise InvalidRequestError(
@@ -323,6 +332,11 @@ def check_plans(batch: Batch, profiles: Mapping[str, Mapping[str, Profile]]) -> 
                     f"{name}: the profile {profile} of task {rollout.task_id!r} has no skill {call.skill}: "
                     f"expected one of {', '.join(allowed)}"
                 )
+
+
+def _name(batch: Batch) -> str:
+    """Return the name of a batch in messages. The id of a batch of turns means nothing to their client."""
+    return "this call" if batch.has_turns else f"batch {batch.batch_id!r}"
 
 
 @contextlib.contextmanager

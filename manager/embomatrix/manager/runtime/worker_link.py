@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, GiveLease, SetDesired
 from embomatrix.rpc.wire.leases import Lease, LeaseRef
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.rpc.status import ClusterError
 
+ACKNOWLEDGE_S: Final = 0.02
+"""Longest time that an acknowledgement waits for other commands."""
 WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
 
 
@@ -49,6 +51,8 @@ class WorkerLink:
         self.session = session
         self._outbox = OutgoingMessage()
         self._ready = asyncio.Event()
+        self._later: asyncio.TimerHandle | None = None
+        """Timer for acknowledgements that no other command takes along."""
         self._closed: ClusterError | None = None
 
     def put(self, command: WorkerCommand) -> None:
@@ -58,7 +62,12 @@ class WorkerLink:
             case GiveLease():
                 self.session.allowed_bundles.add(command.rollout.bundle_digest)
         self._outbox.add(command)
-        self._ready.set()
+        if isinstance(command, AcknowledgeLease):
+            # A message costs more than what it carries, and no worker waits for this one.
+            if self._later is None:
+                self._later = asyncio.get_running_loop().call_later(ACKNOWLEDGE_S, self._ready.set)
+        else:
+            self._ready.set()
 
     def drain(self) -> None:
         self._outbox.drain, self._outbox.resume = True, False
@@ -80,5 +89,8 @@ class WorkerLink:
         if self._closed is not None:
             raise self._closed
         self._ready.clear()
+        if self._later is not None:
+            self._later.cancel()
+            self._later = None
         outbox, self._outbox = self._outbox, OutgoingMessage()
         return outbox

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from grpc.aio import ServicerContext as Context
 
 from embomatrix.manager.observe.training_reports import TrainingBook
+from embomatrix.manager.runtime.open_turns import OpenTurns
 from embomatrix.manager.runtime.results import BatchLog
 from embomatrix.manager.runtime.runs import BATCH_ROLLOUTS, Runs
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
-from embomatrix.proto.v1 import rollout_service_pb2_grpc
+from embomatrix.proto.v1 import rollout_service_pb2_grpc, types_pb2
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translated
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree, software_version
 from embomatrix.rpc.wire.codec import each
-from embomatrix.rpc.wire.rollout import batch_with, rollout_from_proto
+from embomatrix.rpc.wire.outcome import rollout_result_to_proto
+from embomatrix.rpc.wire.rollout import batch_with, checked_turns, rollout_from_proto, turn_from_proto
 from embomatrix.rpc.wire.run import (
     group_done_to_proto,
     lookahead_answer_to_proto,
@@ -42,8 +44,11 @@ ResultsT = TypeVar("ResultsT", pb.ExecuteResponse, pb.WaitExecutionResponse)
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
     """``authority`` is the PEM certificate of the signing authority; empty without TLS."""
 
-    def __init__(self, runs: Runs, training: TrainingBook, gate: Gate, *, authority: bytes = b"") -> None:
+    def __init__(
+        self, runs: Runs, turns: OpenTurns, training: TrainingBook, gate: Gate, *, authority: bytes = b""
+    ) -> None:
         self._runs = runs
+        self._turns = turns
         self._training = training
         self._gate = gate
         self._authority = authority.decode("ascii")
@@ -98,6 +103,12 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self._runs.cancel(request.run_id, request.batch_id)
         return pb.CancelBatchResponse()
 
+    async def Step(self, request: pb.StepRequest, context: Context) -> pb.StepResponse:
+        bind("run", request.run_id)
+        turns = checked_turns(await _sliced("turns", turn_from_proto, request.turns))
+        results = await self._turns.step(request.run_id, turns)
+        return pb.StepResponse(results=[rollout_result_to_proto(result) for result in results])
+
     async def ReportTraining(
         self, request: pb.ReportTrainingRequest, context: Context
     ) -> pb.ReportTrainingResponse:
@@ -132,10 +143,16 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
 
 
 async def _batch(request: pb.ExecuteRequest) -> Batch:
-    """Return the batch of a request. Large batches are converted in slices, so that other calls are not delayed."""
+    return batch_with(request, await _sliced("rollouts", rollout_from_proto, request.rollouts))
+
+
+async def _sliced(
+    field: str, convert: Callable[[types_pb2.Rollout], Rollout], messages: Sequence[types_pb2.Rollout]
+) -> tuple[Rollout, ...]:
+    """Return the rollouts of a request. Many are converted in slices, so that other calls are not delayed."""
     rollouts: list[Rollout] = []
-    for start in range(0, len(request.rollouts), SLICE):
-        part = request.rollouts[start : start + SLICE]
-        rollouts += each("rollouts", rollout_from_proto, part, first=start)
-        await asyncio.sleep(0)
-    return batch_with(request, tuple(rollouts))
+    for start in range(0, len(messages), SLICE):
+        if start:
+            await asyncio.sleep(0)
+        rollouts += each(field, convert, messages[start : start + SLICE], first=start)
+    return tuple(rollouts)

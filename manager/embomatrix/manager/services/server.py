@@ -51,7 +51,9 @@ async def build_server(
         WorkerServicer(runtime, gate, lease_ttl_s=settings.lease_ttl_s), server
     )
     rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(
-        RolloutServicer(runtime.runs, runtime.training, gate, authority=tls.authority if tls else b""),
+        RolloutServicer(
+            runtime.runs, runtime.turns, runtime.training, gate, authority=tls.authority if tls else b""
+        ),
         server,
     )
     scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)

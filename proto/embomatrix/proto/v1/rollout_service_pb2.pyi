@@ -387,6 +387,45 @@ class CancelBatchResponse(google.protobuf.message.Message):
 Global___CancelBatchResponse: typing_extensions.TypeAlias = CancelBatchResponse
 
 @typing.final
+class StepRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RUN_ID_FIELD_NUMBER: builtins.int
+    TURNS_FIELD_NUMBER: builtins.int
+    run_id: builtins.str
+    @property
+    def turns(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[embomatrix.proto.v1.types_pb2.Rollout]:
+        """Rollouts with a prefix, under unique ids."""
+
+    def __init__(
+        self,
+        *,
+        run_id: builtins.str = ...,
+        turns: collections.abc.Iterable[embomatrix.proto.v1.types_pb2.Rollout] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["run_id", b"run_id", "turns", b"turns"]) -> None: ...
+
+Global___StepRequest: typing_extensions.TypeAlias = StepRequest
+
+@typing.final
+class StepResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RESULTS_FIELD_NUMBER: builtins.int
+    @property
+    def results(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[embomatrix.proto.v1.types_pb2.RolloutResult]:
+        """One result for each turn, in the order of the request. Cursors are 0."""
+
+    def __init__(
+        self,
+        *,
+        results: collections.abc.Iterable[embomatrix.proto.v1.types_pb2.RolloutResult] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["results", b"results"]) -> None: ...
+
+Global___StepResponse: typing_extensions.TypeAlias = StepResponse
+
+@typing.final
 class SampledStep(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 

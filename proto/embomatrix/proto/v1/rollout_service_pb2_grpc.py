@@ -65,6 +65,11 @@ class RolloutServiceStub(object):
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchRequest.SerializeToString,
                 response_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchResponse.FromString,
                 _registered_method=True)
+        self.Step = channel.unary_unary(
+                '/embomatrix.proto.v1.RolloutService/Step',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.StepRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.StepResponse.FromString,
+                _registered_method=True)
         self.ReportTraining = channel.unary_unary(
                 '/embomatrix.proto.v1.RolloutService/ReportTraining',
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.ReportTrainingRequest.SerializeToString,
@@ -121,6 +126,13 @@ class RolloutServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Step(self, request, context):
+        """Executes the next calls of many episodes. Nothing is kept: a turn names all earlier calls, and may be sent again at any time.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def ReportTraining(self, request, context):
         """Training report for the dashboard. A repeated phase and step adds figures.
         """
@@ -166,6 +178,11 @@ def add_RolloutServiceServicer_to_server(servicer, server):
                     servicer.CancelBatch,
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchRequest.FromString,
                     response_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchResponse.SerializeToString,
+            ),
+            'Step': grpc.unary_unary_rpc_method_handler(
+                    servicer.Step,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.StepRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.StepResponse.SerializeToString,
             ),
             'ReportTraining': grpc.unary_unary_rpc_method_handler(
                     servicer.ReportTraining,
@@ -341,6 +358,33 @@ class RolloutService(object):
             '/embomatrix.proto.v1.RolloutService/CancelBatch',
             embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchRequest.SerializeToString,
             embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Step(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.RolloutService/Step',
+            embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.StepRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.StepResponse.FromString,
             options,
             channel_credentials,
             insecure,

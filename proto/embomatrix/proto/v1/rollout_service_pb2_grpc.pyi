@@ -121,6 +121,22 @@ _RolloutServiceCancelBatchType = typing_extensions.TypeVar(
     ],
 )
 
+_RolloutServiceStepType = typing_extensions.TypeVar(
+    '_RolloutServiceStepType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.StepRequest,
+        embomatrix.proto.v1.rollout_service_pb2.StepResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.StepRequest,
+        embomatrix.proto.v1.rollout_service_pb2.StepResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.StepRequest,
+        embomatrix.proto.v1.rollout_service_pb2.StepResponse,
+    ],
+)
+
 _RolloutServiceReportTrainingType = typing_extensions.TypeVar(
     '_RolloutServiceReportTrainingType',
     grpc.UnaryUnaryMultiCallable[
@@ -153,7 +169,7 @@ _RolloutServiceCloseRunType = typing_extensions.TypeVar(
     ],
 )
 
-class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _RolloutServiceOpenRunType, _RolloutServiceAnnounceLookaheadType, _RolloutServiceExecuteType, _RolloutServiceWaitExecutionType, _RolloutServiceCancelBatchType, _RolloutServiceReportTrainingType, _RolloutServiceCloseRunType]):
+class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _RolloutServiceOpenRunType, _RolloutServiceAnnounceLookaheadType, _RolloutServiceExecuteType, _RolloutServiceWaitExecutionType, _RolloutServiceCancelBatchType, _RolloutServiceStepType, _RolloutServiceReportTrainingType, _RolloutServiceCloseRunType]):
     """Calls of the trainer."""
 
     @typing.overload
@@ -181,6 +197,10 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.CancelBatchRequest,
             embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.rollout_service_pb2.StepRequest,
+            embomatrix.proto.v1.rollout_service_pb2.StepResponse,
         ],
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
@@ -219,6 +239,10 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
             embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse,
         ],
         grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.rollout_service_pb2.StepRequest,
+            embomatrix.proto.v1.rollout_service_pb2.StepResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
             embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse,
         ],
@@ -243,6 +267,9 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
     """Attaches to a batch after a broken stream, and streams the results after the cursor."""
 
     CancelBatch: _RolloutServiceCancelBatchType
+
+    Step: _RolloutServiceStepType
+    """Executes the next calls of many episodes. Nothing is kept: a turn names all earlier calls, and may be sent again at any time."""
 
     ReportTraining: _RolloutServiceReportTrainingType
     """Training report for the dashboard. A repeated phase and step adds figures."""
@@ -273,6 +300,10 @@ RolloutServiceAsyncStub: typing_extensions.TypeAlias = RolloutServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.rollout_service_pb2.CancelBatchRequest,
         embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.StepRequest,
+        embomatrix.proto.v1.rollout_service_pb2.StepResponse,
     ],
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
@@ -332,6 +363,14 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.CancelBatchRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse]]: ...
+
+    @abc.abstractmethod
+    def Step(
+        self,
+        request: embomatrix.proto.v1.rollout_service_pb2.StepRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.StepResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.StepResponse]]:
+        """Executes the next calls of many episodes. Nothing is kept: a turn names all earlier calls, and may be sent again at any time."""
 
     @abc.abstractmethod
     def ReportTraining(

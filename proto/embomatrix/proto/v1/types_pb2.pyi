@@ -86,6 +86,8 @@ class _InfraCodeEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._Enum
     INFRA_CODE_VERSION_SKEW: _InfraCode.ValueType  # 12
     INFRA_CODE_RESULT_MISMATCH: _InfraCode.ValueType  # 13
     """Two workers gave different results, and no third worker could decide."""
+    INFRA_CODE_PREFIX_MISMATCH: _InfraCode.ValueType  # 14
+    """The prefix of a turn had other failures, or led to another digest, than its client recorded."""
 
 class InfraCode(_InfraCode, metaclass=_InfraCodeEnumTypeWrapper): ...
 
@@ -105,6 +107,8 @@ INFRA_CODE_SLOT_OOM: InfraCode.ValueType  # 11
 INFRA_CODE_VERSION_SKEW: InfraCode.ValueType  # 12
 INFRA_CODE_RESULT_MISMATCH: InfraCode.ValueType  # 13
 """Two workers gave different results, and no third worker could decide."""
+INFRA_CODE_PREFIX_MISMATCH: InfraCode.ValueType  # 14
+"""The prefix of a turn had other failures, or led to another digest, than its client recorded."""
 Global___InfraCode: typing_extensions.TypeAlias = InfraCode
 
 class _Warmth:
@@ -179,6 +183,34 @@ class SkillCall(google.protobuf.message.Message):
 Global___SkillCall: typing_extensions.TypeAlias = SkillCall
 
 @typing.final
+class EpisodePrefix(google.protobuf.message.Message):
+    """Beginning of a plan that an episode has executed before."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    LENGTH_FIELD_NUMBER: builtins.int
+    FAILED_FIELD_NUMBER: builtins.int
+    DIGEST_FIELD_NUMBER: builtins.int
+    length: builtins.int
+    """Number of calls."""
+    digest: builtins.str
+    """`trace_digest` of the result after these calls; empty if unknown, which is not checked."""
+    @property
+    def failed(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
+        """Indices of the calls that failed, rising. The episode went on after them."""
+
+    def __init__(
+        self,
+        *,
+        length: builtins.int = ...,
+        failed: collections.abc.Iterable[builtins.int] | None = ...,
+        digest: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["digest", b"digest", "failed", b"failed", "length", b"length"]) -> None: ...
+
+Global___EpisodePrefix: typing_extensions.TypeAlias = EpisodePrefix
+
+@typing.final
 class Rollout(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -189,6 +221,7 @@ class Rollout(google.protobuf.message.Message):
     PLAN_FIELD_NUMBER: builtins.int
     SEED_FIELD_NUMBER: builtins.int
     RENDER_FIELD_NUMBER: builtins.int
+    PREFIX_FIELD_NUMBER: builtins.int
     ALSO_FIELD_NUMBER: builtins.int
     rollout_id: builtins.str
     group_id: builtins.str
@@ -199,6 +232,10 @@ class Rollout(google.protobuf.message.Message):
     """Needs a slot that renders on a GPU."""
     @property
     def plan(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SkillCall]: ...
+    @property
+    def prefix(self) -> Global___EpisodePrefix:
+        """Set for a turn of an episode: its calls after the prefix are new, and end at the first failure among them."""
+
     @property
     def also(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
         """Ids of further rollouts of the group that are equal in everything else. They are executed once and have equal outcomes."""
@@ -213,9 +250,11 @@ class Rollout(google.protobuf.message.Message):
         plan: collections.abc.Iterable[Global___SkillCall] | None = ...,
         seed: builtins.int = ...,
         render: builtins.bool = ...,
+        prefix: Global___EpisodePrefix | None = ...,
         also: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["also", b"also", "bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "task_id", b"task_id"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["prefix", b"prefix"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["also", b"also", "bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "prefix", b"prefix", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "task_id", b"task_id"]) -> None: ...
 
 Global___Rollout: typing_extensions.TypeAlias = Rollout
 
@@ -296,6 +335,36 @@ class StepResult(google.protobuf.message.Message):
 Global___StepResult: typing_extensions.TypeAlias = StepResult
 
 @typing.final
+class TurnObservation(google.protobuf.message.Message):
+    """State that a turn leads to, in words."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    ROOM_FIELD_NUMBER: builtins.int
+    HELD_FIELD_NUMBER: builtins.int
+    CHANGES_FIELD_NUMBER: builtins.int
+    room: builtins.str
+    """Room of the robot; empty between rooms."""
+    @property
+    def held(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """Object in the robot's hand, then its contents."""
+
+    @property
+    def changes(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """New lines of the table's objects that differ from the state before the turn."""
+
+    def __init__(
+        self,
+        *,
+        room: builtins.str = ...,
+        held: collections.abc.Iterable[builtins.str] | None = ...,
+        changes: collections.abc.Iterable[builtins.str] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["changes", b"changes", "held", b"held", "room", b"room"]) -> None: ...
+
+Global___TurnObservation: typing_extensions.TypeAlias = TurnObservation
+
+@typing.final
 class Timings(google.protobuf.message.Message):
     """Durations of a rollout in seconds. Clocks of two machines are never compared."""
 
@@ -341,6 +410,7 @@ class Completed(google.protobuf.message.Message):
     TIMINGS_FIELD_NUMBER: builtins.int
     WARM_FIELD_NUMBER: builtins.int
     SHARED_STEPS_FIELD_NUMBER: builtins.int
+    OBSERVATION_FIELD_NUMBER: builtins.int
     trace_digest: builtins.str
     worker_id: builtins.str
     warm: builtins.bool
@@ -354,6 +424,10 @@ class Completed(google.protobuf.message.Message):
     def final_state(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]: ...
     @property
     def timings(self) -> Global___Timings: ...
+    @property
+    def observation(self) -> Global___TurnObservation:
+        """Set for a turn; `steps` are then those after the prefix, `final_state` is empty, and `trace_digest` covers the prefix too."""
+
     def __init__(
         self,
         *,
@@ -365,9 +439,10 @@ class Completed(google.protobuf.message.Message):
         timings: Global___Timings | None = ...,
         warm: builtins.bool = ...,
         shared_steps: builtins.int = ...,
+        observation: Global___TurnObservation | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["reward", b"reward", "timings", b"timings"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["final_state", b"final_state", "reward", b"reward", "shared_steps", b"shared_steps", "steps", b"steps", "timings", b"timings", "trace_digest", b"trace_digest", "warm", b"warm", "worker_id", b"worker_id"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["observation", b"observation", "reward", b"reward", "timings", b"timings"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["final_state", b"final_state", "observation", b"observation", "reward", b"reward", "shared_steps", b"shared_steps", "steps", b"steps", "timings", b"timings", "trace_digest", b"trace_digest", "warm", b"warm", "worker_id", b"worker_id"]) -> None: ...
 
 Global___Completed: typing_extensions.TypeAlias = Completed
 

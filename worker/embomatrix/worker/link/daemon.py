@@ -334,7 +334,11 @@ class Daemon:
         """Queue a result for the manager, with this worker's name."""
         self._counts[type(result.outcome)] += 1
         self._outbox.put(sendable(signed(result, self._membership.name)))
-        if self._session is not None:
+        if self._session is None:
+            return
+        if result.awaited:
+            self._session.notify_awaited()
+        else:
             self._session.notify()
 
     def _pause(self, reason: str) -> None:

@@ -47,6 +47,10 @@ LINGER_S: Final = 0.09
 """Shortest interval between result messages while every slot has enough leases ahead; a message costs more than its results."""
 SPACING_S: Final = 0.003
 """Shortest interval while slots run short of leases."""
+AWAITED_SPACING_S: Final = 0.001
+"""Shortest interval before results that a client waits for."""
+AWAITED_BUSY_S: Final = 0.006
+"""The same while every slot has enough leases ahead: then the queue takes several times as long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +123,13 @@ class ManagerSession:
 
     def notify(self) -> None:
         """Send results: now, or with others when the next message is due."""
-        due_s = self._sent_s + (LINGER_S if self._pool.is_saturated else SPACING_S)
+        self._send_at(self._sent_s + (LINGER_S if self._pool.is_saturated else SPACING_S))
+
+    def notify_awaited(self) -> None:
+        """Send results that a client waits for."""
+        self._send_at(self._sent_s + (AWAITED_BUSY_S if self._pool.is_saturated else AWAITED_SPACING_S))
+
+    def _send_at(self, due_s: float) -> None:
         loop = asyncio.get_running_loop()
         if due_s <= loop.time():
             self._due.set()
@@ -284,7 +294,8 @@ class ManagerSession:
         for ref in each("acknowledged", lease_ref_from_proto, response.acknowledged):
             self._outbox.acknowledge(ref)
         cancelled = each("cancelled", lease_ref_from_proto, response.cancelled)
-        self._pool.cancel(cancelled)
+        if cancelled:
+            self._pool.cancel(cancelled)
         for ref in cancelled:
             self._outbox.acknowledge(ref)
         for lease in each("leases", lease_from_proto, response.leases):

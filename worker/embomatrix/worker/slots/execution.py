@@ -21,6 +21,7 @@ from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Timin
 from embomatrix.sim.zygote import PipeMessage
 from embomatrix.worker.slots.processes import ProcessGoneError
 from embomatrix.worker.slots.residents import Residents, ResidentScene, Slot
+from embomatrix.worker.slots.slot_program import SOUND
 
 TakeMore = Callable[[int], Sequence["HeldLease"]]
 Finish = Callable[["HeldLease", Completed | InfraFailure], None]
@@ -28,6 +29,8 @@ Finish = Callable[["HeldLease", Completed | InfraFailure], None]
 ROLLOUTS_PER_SLOT: Final = 5_000
 GROWTH_MB: Final = 128.0
 """A slot's process is replaced after this many rollouts, or if it has grown by this much."""
+TURN_WEAR: Final = 0.1
+"""Rollouts that a turn of an episode counts for: it has one new call, and a new process must execute prefixes again."""
 AHEAD_S: Final = 0.06
 """Execution time of the leases in a slot's stream. Other slots can't take them over, and the manager can't take them back."""
 MOST_AHEAD: Final = 24
@@ -137,8 +140,11 @@ class SlotRun:
         held = self.queue.popleft()
         if "error" in answer.header:
             finish(held, InfraFailure(InfraCode(answer.header["code"]), answer.header["error"]))
-            return False
-        _wear(slot, float(answer.header["resident_mb"]))
+            sound = bool(answer.header.get(SOUND))
+            if sound and self.queue:
+                self.queue[0].first_since_s = time.monotonic()
+            return sound
+        _wear(slot, float(answer.header["resident_mb"]), TURN_WEAR if held.lease.rollout.is_turn else 1.0)
         finish(held, self._completed(held, answer))
         if self.queue:
             self.queue[0].first_since_s = time.monotonic()
@@ -170,6 +176,8 @@ class SlotRun:
 
     def _pause_s(self) -> float:
         """Time that answers may wait in the stream."""
+        if any(held.lease.rollout.is_turn for held in self.queue):
+            return 0.0  # clients wait
         longest_s = GATHER_SHARE * self.scene.execute_mean_s * (len(self.queue) - 1)
         if longest_s < LEAST_GATHER_S:
             return 0.0
@@ -198,8 +206,8 @@ def _frame(held: HeldLease) -> PipeMessage:
     return PipeMessage(header, lease.rollout.wire or rollout_to_proto(lease.rollout).SerializeToString())
 
 
-def _wear(slot: Slot, resident_mb: float) -> None:
-    """Count a rollout; a slot with many rollouts, or one that has grown, is worn."""
-    slot.rollouts += 1
+def _wear(slot: Slot, resident_mb: float, rollouts: float) -> None:
+    """Count rollouts; a slot with many rollouts, or one that has grown, is worn."""
+    slot.rollouts += rollouts
     slot.first_mb = slot.first_mb or resident_mb
     slot.worn = slot.rollouts >= ROLLOUTS_PER_SLOT or resident_mb > slot.first_mb + GROWTH_MB

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.hierarchy import judge, worth
 from embomatrix.reward.settings import PAPER, RewardSettings
@@ -23,6 +23,10 @@ from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
 from embomatrix.worker.slots.warm_up import PLAN, TIMES, WARM_UP, warm_up_bundle
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.inflation import BundleError, bundle_digest
+
+if TYPE_CHECKING:
+    from embomatrix.skills.turns import EpisodePrefix
+    from embomatrix.world.task import Task
 
 CLIENTS_PER_SCENE: Final = 2
 """Physics clients of one engine: one holds the scene, another settles objects."""
@@ -97,6 +101,8 @@ class PhysicsScene:
                 f"bundle {rollout.bundle_digest} has no task {rollout.task_id!r}: "
                 f"it has {len(self._tasks)}; submit the digest of the task's own bundle"
             )
+        if rollout.prefix is not None:
+            return self._execute_turn(task, rollout, rollout.prefix, on_step, reward)
         if self._tree is not None:
             trace, judgement, shared = self._tree.execute(task, rollout.plan, rollout.seed, on_step)
         else:
@@ -112,6 +118,32 @@ class PhysicsScene:
             timings=Timings(),
             warm=True,
             shared_steps=shared,
+        )
+
+    def _execute_turn(
+        self,
+        task: Task,
+        turn: Rollout,
+        prefix: EpisodePrefix,
+        on_step: Callable[[int], None],
+        reward: RewardSettings,
+    ) -> Completed:
+        length = prefix.length
+        if self._tree is not None:
+            run, judgement = self._tree.execute_turn(task, turn.plan, turn.seed, length, on_step)
+        else:
+            run = self._simulator.execute_turn(task, turn.plan, turn.seed, length, on_step)
+            judgement = judge(task, self._simulator.facts)
+        prefix.check(run.steps[:length], run.prefix_digest)
+        return Completed(
+            reward=worth(task, run.touched, judgement, reward),
+            steps=run.steps[length:],
+            final=(),
+            trace_digest=run.digest,
+            worker_id="",
+            timings=Timings(),
+            warm=True,
+            observation=run.observation,
         )
 
 

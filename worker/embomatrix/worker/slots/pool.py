@@ -300,4 +300,6 @@ class SlotPool:
             held_s = outcome.timings.execute_s
         else:
             held_s = time.monotonic() - held.first_since_s if held.slot else 0.0
-        self._on_result(LeaseResult(lease.ref, outcome, lease.origin, held.slot, held_s))
+        self._on_result(
+            LeaseResult(lease.ref, outcome, lease.origin, held.slot, held_s, lease.rollout.is_turn)
+        )

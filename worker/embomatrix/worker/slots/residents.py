@@ -75,7 +75,7 @@ class Slot:
     """Forked process that executes rollouts. A worn one has executed enough or has grown, and is replaced."""
 
     child: Child
-    rollouts: int = 0
+    rollouts: float = 0.0
     first_mb: float = 0.0
     worn: bool = False
 

@@ -42,12 +42,17 @@ from embomatrix.sim.zygote import (
     serve_forks,
     take_small_pages,
 )
+from embomatrix.skills.turns import PrefixMismatchError
 
 MAX_ERROR_CHARS: Final = 500
 IDLE_S: Final = 0.1
 """A slot that is idle this long returns free memory to the system, which takes some milliseconds."""
 COLLECT_EVERY: Final = 32
-"""Rollouts between two garbage collections in a busy slot."""
+"""Rollouts between two garbage collections of a busy slot's new objects."""
+COLLECT_ALL_EVERY: Final = 2_048
+"""Rollouts between two collections of all its objects, which take 10 to 50 ms if its tree of transitions is full."""
+SOUND: Final = "sound"
+"""Key in the header of an error after which the process executes further rollouts."""
 _COUNTER: Final = struct.Struct("=Q")
 
 
@@ -158,7 +163,8 @@ def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board:
 def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, board: ProgressBoard) -> None:
     """Execute rollouts one after another, until the daemon closes the stream or one fails.
 
-    More rollouts may wait in the stream. After an exception the state of this process is unknown, so it must not execute them.
+    More rollouts may wait in the stream. After an exception the state of this process is unknown, so it must not execute them,
+    unless the exception is about the rollout.
     """
     limit_memory(memory_mb)
     take_small_pages()
@@ -166,7 +172,7 @@ def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, boa
     gc.disable()
     for number in itertools.count(1):
         if number % COLLECT_EVERY == 0:
-            gc.collect()
+            gc.collect(2 if number % COLLECT_ALL_EVERY == 0 else 1)
         if not select.select([connection], [], [], IDLE_S)[0]:
             gc.collect()
             give_back_memory()
@@ -177,7 +183,7 @@ def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, boa
         on_step(0)
         answer = _answer(scene, request, on_step)
         send(connection, answer)
-        if "error" in answer.header:
+        if "error" in answer.header and not answer.header.get(SOUND):
             return
 
 
@@ -191,6 +197,9 @@ def _answer(scene: LoadedScene, request: PipeMessage, on_step: Callable[[int], N
         result = completed_to_proto(completed).SerializeToString()
     except MemoryError as error:
         return PipeMessage(_failure(InfraCode.SLOT_OOM, error))
+    except PrefixMismatchError as error:
+        sentence = str(error)[:MAX_ERROR_CHARS]
+        return PipeMessage({"code": InfraCode.PREFIX_MISMATCH.value, "error": sentence, SOUND: True})
     except Exception as error:  # noqa: BLE001  # a defect is an infrastructure failure, never a reward
         return PipeMessage(_failure(InfraCode.SLOT_CRASHED, error))
     header = {

@@ -219,6 +219,9 @@ def _count(state: DispatchState, case: AuditCase, *, mismatch: bool) -> None:
 
 
 def _make_check(state: DispatchState, record: RolloutRecord, excluded: frozenset[str]) -> RolloutRecord:
+    if record.rollout.is_turn:
+        # Only an equal platform reproduces the digest of its prefix.
+        excluded |= _of_other_platforms(state, min(excluded))
     return RolloutRecord(
         key=record.key,
         rollout=record.rollout,
@@ -229,6 +232,12 @@ def _make_check(state: DispatchState, record: RolloutRecord, excluded: frozenset
         excluded_workers=excluded,
         reward=record.reward,
     )
+
+
+def _of_other_platforms(state: DispatchState, worker_id: str) -> frozenset[str]:
+    workers = state.pool.workers
+    known = workers[worker_id].resources.versions if worker_id in workers else {}
+    return frozenset(name for name, worker in workers.items() if worker.resources.versions != known)
 
 
 def _can_execute(state: DispatchState, check: RolloutRecord) -> bool:

@@ -4,6 +4,7 @@ import heapq
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Final
 
 from embomatrix.manager.control.dispatch.records import (
     BatchRecord,
@@ -23,6 +24,9 @@ from embomatrix.rpc.wire.values import (
     InfraFailure,
     Outcome,
 )
+
+FINISHED_KEPT: Final = 64
+"""Finished batches that may wait for their deadline."""
 
 
 class OpenBatches:
@@ -111,6 +115,10 @@ class OpenBatches:
 
     def close(self, batch: BatchRecord) -> None:
         del self._batches[batch.run_id, batch.batch_id]
+        if len(self._due) > 2 * len(self._batches) + FINISHED_KEPT:
+            # Thousands of batches a second may finish behind one long batch at the head.
+            self._due = [entry for entry in self._due if entry[-1].whole.left]
+            heapq.heapify(self._due)
 
     def overdue(self, now_s: float) -> Iterator[tuple[RolloutRecord, float]]:
         """Yield each rollout past its deadline, with the seconds that its batch had."""

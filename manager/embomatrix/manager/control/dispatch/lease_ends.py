@@ -6,7 +6,7 @@ from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease
 from embomatrix.manager.control.dispatch.audits import finish, hold_for_audit, quarantine
 from embomatrix.manager.control.dispatch.leasing import offer_scene
 from embomatrix.manager.control.dispatch.outcomes import requeue
-from embomatrix.manager.control.dispatch.records import LeaseRecord
+from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
 from embomatrix.manager.control.dispatch.state import DispatchState
 from embomatrix.manager.control.events import LeaseFinished
 from embomatrix.manager.control.plausibility import contradiction
@@ -27,6 +27,9 @@ def settle_result(state: DispatchState, event: LeaseFinished) -> None:
             state.runs.of(run_id).counters.stale_results += 1
         return
     match event.outcome:
+        case Completed(observation=None) if lease.record.rollout.is_turn:
+            text = f"{event.worker_id} does not know turns of episodes: upgrade it"
+            _fail(state, lease, InfraFailure(InfraCode.VERSION_SKEW, text, event.worker_id))
         case Completed() as completed:
             wrong = contradiction(completed, lease.record.rollout, lease.record.reward)
             if wrong:
@@ -56,13 +59,21 @@ def give_back(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *
             record.avoid_until_s = state.now_s + state.limits.elsewhere_s
     if record.leases or record.held:
         return
-    policy = state.runs.of(record.key.run_id).terms.group_policy
-    most = 1 if policy is GroupPolicy.FAIL_FAST else state.limits.max_attempts
+    most = _most_attempts(state, record, failure)
     if record.attempts >= most:
         message = f"{failure.message} (attempt {record.attempts} of {most})"
         finish(state, record, dataclasses.replace(failure, message=message))
     else:
         requeue(state, record)
+
+
+def _most_attempts(state: DispatchState, record: RolloutRecord, failure: InfraFailure) -> int:
+    if state.policy_of(record) is GroupPolicy.FAIL_FAST:
+        return 1
+    if failure.code is InfraCode.PREFIX_MISMATCH:
+        # The same worker would find the same; one of another platform may not.
+        return 2 if state.pool.live_count > 1 else 1
+    return state.limits.max_attempts
 
 
 def take_away(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, started: bool) -> None:

@@ -16,6 +16,8 @@ from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseProgress, LeaseRef
 STALE_MEMORY: Final = 65_536
 """Ended leases remembered, to count a late result for its run."""
 
+ENDED_KEPT: Final = 1_024
+"""Ended leases that may wait for the time at which they would have expired."""
 
 LEASE_ID_BYTES: Final = 16
 
@@ -116,6 +118,10 @@ class LeaseTable:
         if not self.in_use[pair]:
             del self.in_use[pair]
         self.remember_ended(lease.ref, lease.record.key.run_id)
+        if len(self._due) > 2 * len(self.live) + ENDED_KEPT:
+            # Thousands of leases a second may end behind a long one at the head.
+            self._due = [entry for entry in self._due if self._is_live(entry[-1])]
+            heapq.heapify(self._due)
 
     def remember_ended(self, ref: LeaseRef, run_id: str) -> None:
         """Remember a lease that ended, or was not adopted from a former manager: its result counts as stale."""

@@ -15,7 +15,15 @@ from embomatrix.manager.control.dispatch.records import (
 )
 from embomatrix.manager.control.dispatch.state import AuditCase, DispatchState
 from embomatrix.rpc.wire.run_log import RolloutStepKind
-from embomatrix.rpc.wire.values import Batch, Cancelled, Completed, InfraFailure, Outcome, RolloutResult
+from embomatrix.rpc.wire.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    GroupPolicy,
+    InfraFailure,
+    Outcome,
+    RolloutResult,
+)
 
 CANCELLED = Cancelled("the trainer called it off")
 
@@ -63,7 +71,8 @@ def deliver(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> No
     group = batch.groups[record.rollout.group_id]
     _conclude(state, record, outcome)
     if isinstance(outcome, InfraFailure):
-        _fail_group(state, batch, group, f"rollout {record.key.rollout_id} was lost: {outcome.code}")
+        policy = state.policy_of(record)
+        _fail_group(state, batch, group, policy, f"rollout {record.key.rollout_id} was lost: {outcome.code}")
 
 
 def return_lease(state: DispatchState, lease: LeaseRecord, why: str) -> None:
@@ -138,10 +147,12 @@ def _conclude(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> 
         _close(state, batch)
 
 
-def _fail_group(state: DispatchState, batch: BatchRecord, group: GroupRecord, why: str) -> None:
+def _fail_group(
+    state: DispatchState, batch: BatchRecord, group: GroupRecord, policy: GroupPolicy, why: str
+) -> None:
     run = state.runs.of(batch.run_id)
     late = state.batches.admit(batch)
-    failed, lost = failed_with(run.terms.group_policy, batch, group)
+    failed, lost = failed_with(policy, batch, group)
     for one in failed:
         run.counters.groups_failed += not one.failed
         one.failed = True

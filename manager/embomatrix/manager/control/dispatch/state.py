@@ -21,7 +21,7 @@ from embomatrix.manager.control.events import Event
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Opinion
 from embomatrix.manager.control.workers import WorkerPool
 from embomatrix.rpc.wire.run_log import RolloutStep, RolloutStepKind
-from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
+from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraCode, InfraFailure
 
 HISTORY_KEPT: Final = 32_768
 """Steps of all rollouts that ``explain`` can look back on, at about 150 bytes each."""
@@ -237,6 +237,12 @@ class DispatchState:
         commands, self._commands = self._commands, []
         return commands
 
+    def policy_of(self, record: RolloutRecord) -> GroupPolicy:
+        """Return the group policy of a rollout. Turns are of many episodes, so none takes others with it."""
+        if record.rollout.is_turn:
+            return GroupPolicy.PARTIAL
+        return self.runs.of(record.key.run_id).terms.group_policy
+
     def end_lease(self, lease: LeaseRecord) -> None:
         """End a lease. Its slot is filled after the event."""
         self.leases.end(lease, self.now_s)
@@ -300,5 +306,5 @@ class DispatchState:
                 assert record.held == (record.key in self.cases and self.cases[record.key].held is record)
         for case in self.cases.values():
             assert case.check.phase is not DispatchPhase.DONE, case.key
-            assert len(case.check.queue.excluded_workers) == len({o.worker_id for o in case.opinions})
+            assert {o.worker_id for o in case.opinions} <= case.check.queue.excluded_workers
         assert not self.freed

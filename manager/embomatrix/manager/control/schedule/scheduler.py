@@ -202,10 +202,13 @@ class Scheduler:
     def _on_submitted(self, event: BatchSubmitted) -> Urgency:
         batch, urgency = event.batch, Urgency.LATER
         for scene in dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts):
-            self.prewarm.demanded(batch.run_id, self._residencies.warm_since_s(scene), self._now_s)
+            if not batch.has_turns:
+                self.prewarm.demanded(batch.run_id, self._residencies.warm_since_s(scene), self._now_s)
             if not self._residencies.having(scene):
                 urgency = Urgency.NOW
-        self._consume(batch)
+        if not batch.has_turns:
+            # Turns use nothing up: more turns of the episode follow in the same scene.
+            self._consume(batch)
         return urgency
 
     def _consume(self, batch: Batch) -> None:

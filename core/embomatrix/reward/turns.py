@@ -1,0 +1,75 @@
+"""Closed-loop episodes: calls in turns, each with an outcome, an observation and the reward so far."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.skills.turns import EpisodePrefix, check_length
+
+if TYPE_CHECKING:
+    from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.skills.trace import Step
+    from embomatrix.skills.turns import TurnObservation
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """Result of an episode's next calls. They end at the first failure, after which the episode may go on."""
+
+    steps: tuple[Step, ...]
+    observation: TurnObservation
+    reward: RewardBreakdown
+    """Reward of all calls so far, as if the episode ended here."""
+    digest: str
+    """Digest of the episode so far: its task, its seed, and the states after all its calls."""
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeStart:
+    """Start of an episode: a task of a bundle, and the seed that decides between equally good outcomes."""
+
+    bundle_digest: str
+    task_id: str
+    seed: int
+
+
+TakeTurn = Callable[[EpisodeStart, "Plan", EpisodePrefix], Awaitable[Turn]]
+"""Executes the calls of a plan after its prefix."""
+
+
+class RunningEpisode:
+    """Episode that goes on turn by turn. It holds all that is known about it: nothing else must be kept anywhere.
+
+    ``take_turn`` executes turns: of a cluster, or in this process.
+    """
+
+    def __init__(self, start: EpisodeStart, take_turn: TakeTurn) -> None:
+        self.start = start
+        self.calls: Plan = ()
+        """Calls so far, failed ones included."""
+        self.prefix = EpisodePrefix()
+        """Length, failed calls and digest of ``calls``."""
+        self._take_turn = take_turn
+        self._acting = False
+
+    async def act(self, calls: Sequence[SkillCall]) -> Turn:
+        """Execute further calls, up to the first that fails. After an error the episode is as before, and may act again.
+
+        Raises EpisodeOverError for no call and for more than 64 in all, PrefixMismatchError if the calls so far have other
+        outcomes now, and RuntimeError during another turn of this episode.
+        """
+        if self._acting:
+            raise RuntimeError("the episode is within a turn: await it before the next one")
+        further = tuple(calls)
+        check_length(self.calls, further)
+        self._acting = True
+        try:
+            turn = await self._take_turn(self.start, (*self.calls, *further), self.prefix)
+        finally:
+            self._acting = False
+        self.calls = (*self.calls, *further[: len(turn.steps)])
+        self.prefix = self.prefix.after(turn.steps, turn.digest)
+        return turn
