@@ -77,7 +77,7 @@ class LocalEpisodes:
         if task is None:
             name = f"bundle {start.bundle_digest} has no task {start.task_id!r}"
             raise KeyError(f"{name}: expected one of its {len(tasks)} tasks")
-        run, judgement = scene.tree.execute_turn(task, plan, start.seed, prefix.length)
+        run, judgement, _ = scene.tree.execute_turn(task, plan, start.seed, prefix.length)
         prefix.check(run.steps[: prefix.length], run.prefix_digest)
         return Turn(
             run.steps[prefix.length :],

@@ -68,7 +68,6 @@ class Mark:
     """State of an execution after some calls. It belongs to the simulator that made it."""
 
     task: Task
-    seed: int
     calls: Plan
     """Calls so far, in a mode that returns by executing them again."""
     succeeded: int
@@ -77,10 +76,9 @@ class Mark:
     world: WorldMark | None
     """None in such a mode."""
 
-    @property
-    def digest(self) -> str:
-        """Digest of the episode so far: its task, its seed, and every pose and state after every call."""
-        episode = f"{self.task.task_id}\n{self.seed}\n".encode() + self.hash.digest()
+    def digest(self, seed: int) -> str:
+        """Digest of an episode that is in this state: its task, its seed, and every pose and state after every call."""
+        episode = f"{self.task.task_id}\n{seed}\n".encode() + self.hash.digest()
         return f"sha256:{hashlib.sha256(episode).hexdigest()}"
 
 
@@ -155,6 +153,15 @@ class Simulator:
         """Objects on which a call succeeded since the last reset."""
         return frozenset(self._touched)
 
+    @property
+    def drawing(self) -> Set[Skill]:
+        """Skills whose calls draw random numbers. Until the first of them, the seed changes nothing."""
+        return self._actor.drawing
+
+    def draw_from(self, seed: int) -> None:
+        """Continue with another seed. No call since the last reset may have drawn."""
+        self._seed = seed
+
     def reset(self, task: Task, seed: int) -> None:
         """Return to the scene's start. ``seed`` (not negative) decides between equally good outcomes."""
         self.world.reset(task)
@@ -198,7 +205,6 @@ class Simulator:
         world = None if self._actor.keeps_state else self.world.mark()
         return Mark(
             self._task,
-            self._seed,
             tuple(self._calls) if world is None else (),
             self._succeeded,
             self.touched,
@@ -213,19 +219,19 @@ class Simulator:
         """
         return self.mark() if before.world is None else replace(before, hash=self._hash.copy())
 
-    def return_to(self, mark: Mark) -> None:
-        """Take on a state that this simulator marked: all that follows is bit-equal to what followed then.
+    def return_to(self, mark: Mark, seed: int) -> None:
+        """Take on a state that this simulator marked. What follows is bit-equal to what follows the same calls with ``seed``.
 
-        The time depends on the number of objects that have changed. A mode whose actor keeps state of its own executes the
-        calls again.
+        No call before the mark may have drawn a random number, unless with this seed. The time depends on the number of
+        objects that have changed. A mode whose actor keeps state of its own executes the calls again.
         """
         if mark.world is None:
-            self.reset(mark.task, mark.seed)
+            self.reset(mark.task, seed)
             for call in mark.calls:
                 self.run_step(call)
             return
         self.world.return_to(mark.world)
-        self._task, self._seed = mark.task, mark.seed
+        self._task, self._seed = mark.task, seed
         self._succeeded = mark.succeeded
         self._touched = set(mark.touched)
         self._hash = mark.hash.copy()
@@ -269,7 +275,8 @@ class Simulator:
             if not steps[-1].ok:
                 break
         end = self.mark()
-        return TurnRun(tuple(steps), start.digest, end.digest, end.touched, self.observe(task, before))
+        digests = start.digest(seed), end.digest(seed)
+        return TurnRun(tuple(steps), *digests, end.touched, self.observe(task, before))
 
     def describe(self, task: Task) -> tuple[str, ...]:
         """State in words of the goal's objects and of those that a call succeeded on, in the table's order."""

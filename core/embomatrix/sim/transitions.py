@@ -1,7 +1,8 @@
 """Tree of transitions: the calls that plans have in common are executed once.
 
 A call after the same calls of the same task with the same seed has the same outcome to the bit. So a plan walks down the tree
-as far as it is known, and only the rest is executed.
+as far as it is known, and only the rest is executed. The seed matters from the first call that draws a random number: calls
+before it are shared by all seeds.
 """
 
 from __future__ import annotations
@@ -25,16 +26,18 @@ NODES_KEPT: Final = 4_000
 """Nodes in memory, about 3 kB each."""
 
 T = TypeVar("T")
-_Key: TypeAlias = "SkillCall | tuple[str, int]"
+_Key: TypeAlias = "str | SkillCall | tuple[SkillCall, int]"
 
 
 @dataclass(slots=True, eq=False)
 class _Node(Generic[T]):
-    """State after a call, or the start of a task with a seed, whose parent is the tree's root."""
+    """State after a call, or the start of a task, whose parent is the tree's root."""
 
     parent: _Node[T] | None = None
-    key: _Key = ("", 0)
-    """Key in the parent's children: the call, or for a start task id and seed."""
+    key: _Key = ""
+    """Key in the parent's children: the call, with the seed if it is the first that draws; for a start the task id."""
+    drawn: bool = False
+    """A call on the way here has drawn: the state belongs to one seed."""
     step: Step | None = None
     mark: Mark | None = None
     """None for a start that was not asked for its mark."""
@@ -55,6 +58,7 @@ class TransitionTree(Generic[T]):
 
     def __init__(self, simulator: Simulator, judge: Callable[[Task], T], most: int = NODES_KEPT) -> None:
         self._simulator = simulator
+        self._drawing = simulator.drawing
         self._judge = judge
         self._most = most
         self._root: _Node[T] = _Node()
@@ -84,15 +88,14 @@ class TransitionTree(Generic[T]):
 
     def execute_turn(
         self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None] = lambda _: None
-    ) -> tuple[TurnRun, T]:
-        """Return the run of a turn whose first ``prefix`` calls are its episode's past, and the judgement of its end.
+    ) -> tuple[TurnRun, T, int]:
+        """Return the run of a turn, the judgement of its end, and the number of its steps that were known.
 
-        Equal to ``Simulator.execute_turn`` and a judgement of the final state.
+        The first ``prefix`` calls are its episode's past. Equal to ``Simulator.execute_turn`` and a judgement of the final
+        state.
         """
-        self._mark_of(
-            self._start(task, seed), task, seed
-        )  # while the simulator is there, if it must go there
-        nodes, _ = self._walk(task, plan, seed, prefix, on_step)
+        self._mark_of(self._start(task), task, seed)  # while the simulator is there, if it must go there
+        nodes, shared = self._walk(task, plan, seed, prefix, on_step)
         begin, end = nodes[prefix], nodes[-1]
         if end.turn is None or end.turn[0] != prefix:
             before = self._world_at(begin, task, seed)
@@ -101,7 +104,8 @@ class TransitionTree(Generic[T]):
         _, observation, judgement = end.turn
         first, last = self._mark_of(begin, task, seed), self._mark_of(end, task, seed)
         self._use(end)
-        return TurnRun(_steps_of(nodes), first.digest, last.digest, last.touched, observation), judgement
+        digests = first.digest(seed), last.digest(seed)
+        return TurnRun(_steps_of(nodes), *digests, last.touched, observation), judgement, shared
 
     def _walk(
         self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None]
@@ -110,9 +114,9 @@ class TransitionTree(Generic[T]):
 
         The plan ends at its first failure after the ``prefix``.
         """
-        nodes = [self._start(task, seed)]
+        nodes = [self._start(task)]
         for call in plan:
-            known = nodes[-1].children.get(call)
+            known = nodes[-1].children.get(self._key(nodes[-1], call, seed))
             if known is None or _is_over(nodes, prefix):
                 break
             nodes.append(known)
@@ -122,26 +126,30 @@ class TransitionTree(Generic[T]):
         if shared < len(plan) and not _is_over(nodes, prefix):
             self._go_to(nodes[-1], task, seed)
             for call in plan[shared:]:
-                nodes.append(self._run(nodes[-1], call))
+                nodes.append(self._run(nodes[-1], call, seed))
                 on_step(len(nodes) - 1)
                 if _is_over(nodes, prefix):
                     break
         return nodes, shared
 
-    def _start(self, task: Task, seed: int) -> _Node[T]:
-        key = (task.task_id, seed)
+    def _start(self, task: Task) -> _Node[T]:
+        key = task.task_id
         start = self._root.children.get(key)
         if start is None:
             start = self._root.children[key] = _Node(self._root, key)
         return start
 
-    def _run(self, node: _Node[T], call: SkillCall) -> _Node[T]:
+    def _key(self, node: _Node[T], call: SkillCall, seed: int) -> _Key:
+        return (call, seed) if not node.drawn and call.skill in self._drawing else call
+
+    def _run(self, node: _Node[T], call: SkillCall, seed: int) -> _Node[T]:
         """Execute a call at the simulator's present node."""
         simulator = self._simulator
         step = simulator.run_step(call)
         before = None if step.ok else node.mark
         mark = simulator.mark() if before is None else simulator.mark_after_failure(before)
-        child = node.children[call] = _Node(node, call, step, mark)
+        key = self._key(node, call, seed)
+        child = node.children[key] = _Node(node, key, node.drawn or key is not call, step, mark)
         self._here = child
         return child
 
@@ -163,9 +171,11 @@ class TransitionTree(Generic[T]):
     def _go_to(self, node: _Node[T], task: Task, seed: int) -> None:
         """Bring the simulator to the state of a node."""
         if self._here is node:
+            if not node.drawn:
+                self._simulator.draw_from(seed)
             return
         if node.mark is not None:
-            self._simulator.return_to(node.mark)
+            self._simulator.return_to(node.mark, seed)
         else:
             self._simulator.reset(task, seed)
         self._here = node

@@ -55,7 +55,7 @@ def walk(simulators, task, seed, moves):
     marks, prefixes = [walker.mark()], [()]
     for back, calls in moves:
         number = back % len(marks)
-        walker.return_to(marks[number])
+        walker.return_to(marks[number], seed)
         prefix = prefixes[number]
         plain.reset(task, seed)
         for call in prefix:
@@ -118,7 +118,7 @@ def test_running_water_that_was_undone_acts_again(scenes):
     assert all(simulator.run_step(call).ok for call in start)
     mark = simulator.mark()
     first = simulator.run_step(on)
-    simulator.return_to(mark)
+    simulator.return_to(mark, 0)
     assert simulator.run_step(on) == first
     assert "soaked" in first.message
 
@@ -135,7 +135,7 @@ def test_return_in_physical_mode_equals_executing_the_calls_again(seed):
         assert [simulator.run_step(call).ok for call in start] == [True, True, False, True]
         mark = simulator.mark()
         first = (simulator.run_step(last), seen(simulator, task))
-        simulator.return_to(mark)
+        simulator.return_to(mark, seed)
         simulator.run_step(plan_of(task, "move breakfast_table_1")[0])
-        simulator.return_to(mark)
+        simulator.return_to(mark, seed)
         assert (simulator.run_step(last), seen(simulator, task)) == first

@@ -130,8 +130,9 @@ class PhysicsScene:
     ) -> Completed:
         length = prefix.length
         if self._tree is not None:
-            run, judgement = self._tree.execute_turn(task, turn.plan, turn.seed, length, on_step)
+            run, judgement, shared = self._tree.execute_turn(task, turn.plan, turn.seed, length, on_step)
         else:
+            shared = 0
             run = self._simulator.execute_turn(task, turn.plan, turn.seed, length, on_step)
             judgement = judge(task, self._simulator.facts)
         prefix.check(run.steps[:length], run.prefix_digest)
@@ -143,6 +144,7 @@ class PhysicsScene:
             worker_id="",
             timings=Timings(),
             warm=True,
+            shared_steps=max(0, shared - length),
             observation=run.observation,
         )
 
