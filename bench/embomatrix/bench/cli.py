@@ -150,16 +150,23 @@ def traffic(
     json_file: Json = None,
     rounds: Annotated[int, typer.Option(min=1, help="Replays of each phase.")] = 3,
 ) -> None:
-    """Replay what a training run submitted, with and without shared calls, and through other libraries."""
+    """Replay what a training run submitted, with and without shared calls, and through other libraries; play episodes."""
+    from embomatrix.bench.traffic.marks import bench_marks
     from embomatrix.bench.traffic.recording import recorded_traffic, shipped_traffic
     from embomatrix.bench.traffic.replay import TrafficSizes, bench_traffic
+    from embomatrix.bench.traffic.turns import TurnSizes, bench_turns
+
+    def measure(on_step: OnStep) -> Sequence[Figure]:
+        on_step("returns to earlier states")
+        marks = bench_marks(pinned)
+        return (*bench_traffic(found, sizes, on_step), *marks, *bench_turns(pinned, TurnSizes(), on_step))
 
     if (record is None) != (dataset is None):
         raise typer.BadParameter("--record and --dataset belong together: expected both or none")
     with refusals():
         found = shipped_traffic() if record is None or dataset is None else recorded_traffic(record, dataset)
-        sizes = TrafficSizes(rounds=rounds)
-        hand_in(_measured("traffic", lambda on_step: bench_traffic(found, sizes, on_step)), json_file)
+        pinned, sizes = load_workload(PINNED), TrafficSizes(rounds=rounds)
+        hand_in(_measured("traffic", measure), json_file)
 
 
 @app.command()

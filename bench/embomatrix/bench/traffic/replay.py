@@ -29,6 +29,7 @@ from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.traffic import SubmittedGroup
 from embomatrix.rpc.wire.rollout import merged
 from embomatrix.rpc.wire.values import Rollout, RunStats
+from embomatrix.skills.syntax import Skill, SkillCall
 
 logger = logging.getLogger(__name__)
 
@@ -38,8 +39,6 @@ SHARE_GOAL: Final = 0.65
 LATE_SHARE_GOAL: Final = 0.75
 OVERHEAD_GOAL_US: Final = 200.0
 LEAD_GOAL: Final = 2.0
-ROUND_SEEDS: Final = 2**32
-"""Distance of the seeds of two rounds. Seeds of the trainer are smaller."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ class TrafficSizes:
     peers: tuple[PeerSystem, ...] = tuple(PeerSystem)
     slots: int = 2
     rounds: int = 3
-    """Replays of each phase, each with seeds of its own: no call is known from the round before."""
+    """Replays of each phase, each through a new cluster: no call is known from the round before."""
     batch: int = 8
     """Groups that are submitted together, as the trainer does."""
     in_flight: int = 8
@@ -65,20 +64,27 @@ class PhaseReplay:
     """Measurements of one phase over all rounds."""
 
     rollouts: int
+    """Rollouts of one round."""
     walls_s: tuple[float, ...]
-    used: CpuUse
+    used: tuple[CpuUse, ...]
     stats: RunStats
+    """Counters of the last round."""
+
+    @property
+    def count(self) -> int:
+        """Rollouts of all rounds."""
+        return self.rollouts * len(self.walls_s)
 
     @property
     def rate(self) -> float:
         """Rollouts per second of the median round."""
-        return self.rollouts / len(self.walls_s) / float(np.median(self.walls_s))
+        return self.rollouts / float(np.median(self.walls_s))
 
     @property
     def overhead_us(self) -> float:
-        """CPU time of manager, daemon and trainer for each rollout, in microseconds."""
-        outside_s = self.used.manager_s + self.used.daemons_s + self.used.trainer_s
-        return outside_s / self.rollouts * 1e6
+        """CPU time of manager, daemon and trainer for each rollout of the median round, in microseconds."""
+        outside_s = [used.manager_s + used.daemons_s + used.trainer_s for used in self.used]
+        return float(np.median(outside_s)) / self.rollouts * 1e6
 
 
 def bench_traffic(
@@ -95,7 +101,7 @@ def bench_traffic(
         on_step(f"replaying {len(groups)} groups{suffix.replace('_', ', ')}")
         shared[suffix] = found = _replay(traffic, groups, sizes, sharing=True)
         plain = _replay(traffic, groups, sizes, sharing=False)
-        count = found.rollouts
+        count = found.count
         figures += [
             Figure(f"traffic_rollouts_per_s{suffix}", found.rate, "1/s", Better.HIGHER, count, rate_goal),
             Figure(f"traffic_rollouts_per_s{suffix}, no sharing", plain.rate, "1/s", Better.HIGHER, count),
@@ -116,46 +122,40 @@ def bench_traffic(
 
 
 def _costs(suffix: str, found: PhaseReplay) -> list[Figure]:
-    goal = OVERHEAD_GOAL_US if suffix else None
+    phase, goal = ("late", OVERHEAD_GOAL_US) if suffix else ("early", None)
     parts = {
-        "manager": found.used.manager_s,
-        "worker beside its slots": found.used.daemons_s,
-        "trainer": found.used.trainer_s,
-        "slots": found.used.slots_s,
+        "manager": [used.manager_s for used in found.used],
+        "worker beside its slots": [used.daemons_s for used in found.used],
+        "trainer": [used.trainer_s for used in found.used],
+        "slots": [used.slots_s for used in found.used],
     }
-    phase = "late" if suffix else "early"
+
+    def figure(name: str, value_us: float, goal_us: float | None = None) -> Figure:
+        return Figure(name, value_us, "µs", Better.LOWER, found.count, goal_us)
+
     return [
-        Figure(f"overhead_cpu_us{suffix}", found.overhead_us, "µs", Better.LOWER, found.rollouts, goal),
+        figure(f"overhead_cpu_us{suffix}", found.overhead_us, goal),
         *(
-            Figure(
-                f"CPU of a rollout, {phase}: {part}",
-                seconds / found.rollouts * 1e6,
-                "µs",
-                Better.LOWER,
-                found.rollouts,
-            )
+            figure(f"CPU of a rollout, {phase}: {part}", float(np.median(seconds)) / found.rollouts * 1e6)
             for part, seconds in parts.items()
         ),
-    ]
-
-
-def rounds_of(groups: Sequence[SubmittedGroup], rounds: int) -> list[list[tuple[Rollout, ...]]]:
-    """Return the rollouts of each group in each round; later rounds have other seeds."""
-    return [
-        [
-            tuple(replace(one, seed=one.seed + number * ROUND_SEEDS) for one in group.rollouts(f"{number}/"))
-            for group in groups
-        ]
-        for number in range(rounds)
     ]
 
 
 def _replay(
     traffic: RecordedTraffic, groups: Sequence[SubmittedGroup], sizes: TrafficSizes, *, sharing: bool
 ) -> PhaseReplay:
-    """Replay a phase through a fresh cluster. Without sharing, every rollout is executed from its start."""
+    """Replay a phase through fresh clusters. Without sharing, every rollout is executed from its start."""
+    rounds = [_round(traffic, groups, sizes, sharing=sharing) for _ in range(sizes.rounds)]
+    walls_s, used, stats = zip(*rounds, strict=True)
+    return PhaseReplay(sum(len(group.members) for group in groups), walls_s, used, stats[-1])
+
+
+def _round(
+    traffic: RecordedTraffic, groups: Sequence[SubmittedGroup], sizes: TrafficSizes, *, sharing: bool
+) -> tuple[float, CpuUse, RunStats]:
     deadline_s = time.monotonic() + sizes.limit_s
-    rounds = rounds_of(groups, sizes.rounds)
+    rollouts = [group.rollouts() for group in groups]
     with (
         tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name,
         bench_cluster(
@@ -163,28 +163,27 @@ def _replay(
         ) as cluster,
     ):
 
-        async def measure() -> PhaseReplay:
+        async def measure() -> tuple[float, CpuUse, RunStats]:
             opened = load_generator(cluster, traffic.bundles, deadline_s - time.monotonic(), merging=sharing)
             async with opened as load:
-                await load.warm_up([rollouts[0] for rollouts in rounds[0]])
-                await _touch_scenes(load, rounds[0])
+                await load.warm_up([group[0] for group in rollouts])
+                await _touch_scenes(load, rollouts)
                 before = CpuWatch(cluster)
-                walls_s = [await _submit(load, one, sizes) for one in rounds]
-                used = before.used()
-                count = sum(len(rollouts) for one in rounds for rollouts in one)
-                return PhaseReplay(count, tuple(walls_s), used, await load.close())
+                wall_s = await _submit(load, rollouts, sizes)
+                return wall_s, before.used(), await load.close()
 
         return asyncio.run(measure())
 
 
 async def _touch_scenes(load: LoadGenerator, groups: Sequence[Sequence[Rollout]]) -> None:
-    """Execute one plan in each scene, with another seed, so that no process is forked on the clock for the first time."""
+    """Execute one call in each scene, so that processes are forked and have loaded all code when the clock starts."""
     firsts = {rollouts[0].bundle_digest: rollouts[0] for rollouts in groups}
     for number in range(2):
+        names = [f"first/{number}/{at}" for at in range(len(firsts))]
         await load.submit(
             [
-                replace(one, rollout_id=f"first/{number}/{at}", group_id=f"first/{number}/{at}", seed=at)
-                for at, one in enumerate(firsts.values())
+                replace(one, rollout_id=name, group_id=name, plan=(SkillCall(Skill.TURN, yaw=0.1 + number),))
+                for name, one in zip(names, firsts.values(), strict=True)
             ]
         )
 
@@ -214,7 +213,7 @@ def _lead(
     figures = []
     for suffix, rate in found.items():
         lead = ours[suffix].rate / rate
-        count = ours[suffix].rollouts
+        count = ours[suffix].count
         figures += [
             Figure(f"traffic_vs_{peer.value}{suffix}", lead, "×", Better.HIGHER, count, LEAD_GOAL),
             Figure(f"traffic through {peer.value}{suffix}, 1/s", rate, "1/s", Better.HIGHER, count),
@@ -231,9 +230,9 @@ def peer_rates(peer: PeerSystem, traffic: RecordedTraffic, sizes: TrafficSizes) 
             await_processes(contender, sizes.slots, sizes.start_s)
             rates = {}
             for suffix, groups in (("", traffic.early), ("_late", traffic.late)):
+                chunks: list[RolloutChunk] = [tuple(merged(group.rollouts())) for group in groups]
                 walls_s = []
-                for rollouts in rounds_of(groups, sizes.rounds):
-                    chunks: list[RolloutChunk] = [tuple(merged(group)) for group in rollouts]
+                for _ in range(sizes.rounds):
                     outcome = execute(contender, chunks, sizes.limit_s)
                     if outcome.lost or outcome.hung:
                         raise BenchError(f"{peer.value} lost {outcome.lost + outcome.hung} rollouts")
