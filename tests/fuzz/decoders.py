@@ -59,6 +59,8 @@ OWN: Final[Mapping[str, str]] = {
     "bench.adversary.sequences:_honest_worker": BENCH,
     "bench.adversary.siege:read_state": BENCH,
     "bench.adversary.trainer_kinds:_padded_call": BENCH,
+    "bench.traffic.recording:save_sample": BENCH,
+    "bench.traffic.recording:shipped_traffic": BENCH,
     "bench.adversary.worker_kinds:_padded_step": BENCH,
     "bench.experiments.benchmarks:bench_table": BENCH,
     "bench.experiments.cli:_conduct": BENCH,

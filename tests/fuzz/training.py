@@ -8,10 +8,12 @@ import json
 import random
 from dataclasses import asdict
 
+import msgspec
 import torch
 from tests.fuzz.decoder import Decoder, in_file, mutate_bytes, mutate_json, mutate_json_lines, text_of
 
 from embomatrix.cli.evaluate import read_eval_settings
+from embomatrix.rpc.traffic import SubmittedGroup, TrafficError, read_traffic
 from embomatrix.trainer.commands.eai import _read as read_eai_answers
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import TrainSettings, read_settings
@@ -48,6 +50,16 @@ def _eval_settings(data: bytes) -> object:
 
 def _state(data: bytes) -> object:
     return read_state(in_file("checkpoint/state.json", data).parent)
+
+
+def _traffic(data: bytes) -> object:
+    return [group.rollouts() for group in read_traffic([data])]
+
+
+def _traffic_line() -> bytes:
+    return msgspec.json.encode(
+        SubmittedGroup("step-1-0/0", 1, 0.5, "sha256:1", "t", 7, ("move 1\npick_up 1", "move 2"), (0, 1, 0))
+    )
 
 
 def _tensors(data: bytes) -> object:
@@ -164,6 +176,13 @@ def table() -> dict[str, Decoder]:
             lambda: (b"samples = 2\ntemperature = 0.5\n",),
             frozenset({"trainer.config.settings:read_toml", "cli.evaluate:read_eval_settings"}),
             mutate_bytes,
+        ),
+        "recorded traffic": Decoder(
+            _traffic,
+            (TrafficError,),
+            lambda: (_traffic_line(),),
+            frozenset(),
+            mutate_json,
         ),
         "state of a checkpoint": Decoder(
             _state,

@@ -107,6 +107,7 @@ COMPLETED = st.builds(
     TEXTS,
     st.builds(Timings, SECONDS, SECONDS, SECONDS),
     st.booleans(),
+    st.integers(0, 3),
     st.none() | OBSERVATIONS,
 )
 FAILURES = st.builds(InfraFailure, st.sampled_from(InfraCode), TEXTS, TEXTS)

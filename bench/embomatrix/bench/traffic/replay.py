@@ -29,7 +29,7 @@ from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.traffic import SubmittedGroup
 from embomatrix.rpc.wire.rollout import merged
 from embomatrix.rpc.wire.values import Rollout, RunStats
-from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.syntax import MAX_STEPS, Skill, SkillCall
 
 logger = logging.getLogger(__name__)
 
@@ -167,7 +167,8 @@ def _round(
             opened = load_generator(cluster, traffic.bundles, deadline_s - time.monotonic(), merging=sharing)
             async with opened as load:
                 await load.warm_up([group[0] for group in rollouts])
-                await _touch_scenes(load, rollouts)
+                # Processes are forked and have copied their pages when the clock starts.
+                await _submit(load, list(map(elsewhere, rollouts)), sizes)
                 before = CpuWatch(cluster)
                 wall_s = await _submit(load, rollouts, sizes)
                 return wall_s, before.used(), await load.close()
@@ -175,17 +176,18 @@ def _round(
         return asyncio.run(measure())
 
 
-async def _touch_scenes(load: LoadGenerator, groups: Sequence[Sequence[Rollout]]) -> None:
-    """Execute one call in each scene, so that processes are forked and have loaded all code when the clock starts."""
-    firsts = {rollouts[0].bundle_digest: rollouts[0] for rollouts in groups}
-    for number in range(2):
-        names = [f"first/{number}/{at}" for at in range(len(firsts))]
-        await load.submit(
-            [
-                replace(one, rollout_id=name, group_id=name, plan=(SkillCall(Skill.TURN, yaw=0.1 + number),))
-                for name, one in zip(names, firsts.values(), strict=True)
-            ]
+def elsewhere(rollouts: Sequence[Rollout]) -> list[Rollout]:
+    """Return the rollouts with another first call: no state that they reach is one that the originals reach."""
+    turn = SkillCall(Skill.TURN, yaw=0.1)
+    return [
+        replace(
+            one,
+            rollout_id=f"first/{one.rollout_id}",
+            group_id=f"first/{one.group_id}",
+            plan=(turn, *one.plan)[:MAX_STEPS],
         )
+        for one in rollouts
+    ]
 
 
 async def _submit(load: LoadGenerator, groups: Sequence[Sequence[Rollout]], sizes: TrafficSizes) -> float:
