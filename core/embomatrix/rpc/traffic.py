@@ -93,7 +93,7 @@ def read_traffic(lines: Iterable[bytes]) -> Iterator[SubmittedGroup]:
     for number, line in enumerate(lines, start=1):
         try:
             group = decoder.decode(line)
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise TrafficError(
                 f"line {number} of the traffic is not a submitted group ({error}): record it again with "
                 "`embomatrix train --record`"
