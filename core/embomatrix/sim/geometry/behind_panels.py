@@ -86,8 +86,10 @@ def _blocked(
     lows = np.array([box.low_m for box in boxes]).reshape(-1, 1, 3)
     highs = np.array([box.high_m for box in boxes]).reshape(-1, 1, 3)
     level = (points[:, 2] > lows[..., 2]) & (points[:, 2] < highs[..., 2])  # (k, n)
-    crossed = _crossed(base[:2], points[:, :2], lows[..., :2] - margin_m, highs[..., :2] + margin_m)
-    return np.asarray((level & crossed).any(axis=0))
+    # Most boxes are above or below all points, and the slab test takes ten times as long as this one.
+    chosen = level.any(axis=1)
+    lows, highs = lows[chosen, :, :2] - margin_m, highs[chosen, :, :2] + margin_m
+    return np.asarray((level[chosen] & _crossed(base[:2], points[:, :2], lows, highs)).any(axis=0))
 
 
 def _crossed(base: FloatArray, points: FloatArray, lows: FloatArray, highs: FloatArray) -> BoolArray:
@@ -98,6 +100,8 @@ def _crossed(base: FloatArray, points: FloatArray, lows: FloatArray, highs: Floa
     way = points - base
     way = np.where(np.abs(way) > 1e-12, way, 1e-12)
     one, other = (lows - base) / way, (highs - base) / way  # (k, n, 2)
-    enter = np.minimum(one, other).max(axis=2)
-    leave = np.maximum(one, other).min(axis=2)
+    first, last = np.minimum(one, other), np.maximum(one, other)
+    # Two columns: comparing them takes a tenth of a reduction along the short axis.
+    enter = np.maximum(first[..., 0], first[..., 1])
+    leave = np.minimum(last[..., 0], last[..., 1])
     return np.asarray((enter < leave) & (leave > 0.0) & (leave < 1.0))
