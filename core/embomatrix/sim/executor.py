@@ -244,8 +244,9 @@ class Simulator:
         yield from world.placer.warm_up()
         yield from world.navigator.warm_up()
         yield from world.swings.warm_up()
+        yield from world.warm_up(self._tables)
         # Least useful, so last: a slot that is forked early misses it the least.
-        yield from world.placer.options.warm_up(self._tables)
+        yield from world.placer.warm_up_pairs(self._tables)
 
     def close(self) -> None:
         """Close the engine and the actor and end the simulator's use."""

@@ -1,7 +1,7 @@
 """State of a rollout: the engine's scene, the symbolic states, the robot's base and its hand."""
 
 import itertools
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 from embomatrix.sim.engine import EngineMark, PhysicsEngine
@@ -202,6 +202,25 @@ class LiveWorld:
         self.water.return_to(mark.acting)
         self.table = mark.table
         self.navigator.refresh()
+
+    def warm_up(self, tables: Sequence[Sequence[str]]) -> Iterator[None]:
+        """Look for places beside and behind the open doors of each table's objects, one object per step. Changes no answer.
+
+        Only the unchanged scene is used, before the first reset. It is reset after each step.
+        """
+        for name in dict.fromkeys(itertools.chain.from_iterable(tables)):
+            if not self.swings.is_predicted(name) or self.engine.state_bytes():
+                continue
+            before = self.navigator.nearest_stand(name, self.navigator.start)
+            self.swings.open(name)
+            self.navigator.refresh()
+            if before is not None:
+                self.navigator.step_aside(name, before)
+                self.navigator.nearest_stand(name, before)
+            self.placer.look_into(name, tables)
+            self.engine.reset()
+            self.navigator.refresh()
+            yield
 
     def let_sources_act(self) -> tuple[Change, ...]:
         """Let heat, cold and water act on the objects at their sources. Return the changes."""

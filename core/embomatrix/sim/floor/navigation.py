@@ -243,7 +243,7 @@ class Navigator:
     def line_would_be_clear(self, origin: StandPose, box: Aabb, own: Iterable[str]) -> bool:
         """Evaluate ``line_is_clear`` for an object that is not there yet: ``own`` are its name and its would-be hosts."""
         numbers = [self.ground.numbers[name] for name in own]
-        return not crosses(*_line(origin, box), self.ground.obstacles.blockers(box, numbers))
+        return not self.ground.obstacles.block_line(*_line(origin, box), box, numbers)
 
     def is_as_loaded(self, name: str) -> bool:
         """Return True if the object and its hosts are where the scene has them."""

@@ -1,7 +1,7 @@
 """Placement of a held object: the first verified pose that is still free and in reach."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, TypeVar
 
 import numpy as np
@@ -9,10 +9,11 @@ import numpy as np
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import bounds_of
-from embomatrix.sim.geometry.candidates import candidates
-from embomatrix.sim.geometry.surfaces import is_upright
+from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, candidates
+from embomatrix.sim.geometry.surfaces import is_upright, links_with_surfaces
+from embomatrix.sim.placing.loaded_places import MovedObjects, loaded_places
 from embomatrix.sim.placing.options import PlacementOptions
-from embomatrix.sim.placing.search import LIVE_TRIES, PlacementSearch
+from embomatrix.sim.placing.search import LIVE_TRIES, PlacementSearch, link_frames
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.geometry import IDENTITY, Pose
@@ -46,6 +47,7 @@ class Placer:
         self._scene = engine.scene
         self.options = PlacementOptions(engine.scene, cache)
         self._reached = cache.reached
+        self._moved = MovedObjects(engine)
 
     def warm_up(self) -> Iterator[None]:
         """Compute footprints, contact polygons and part boxes, one asset per step. Changes no answer."""
@@ -57,6 +59,42 @@ class Placer:
                 yield
             bounds_of(asset).part_boxes(IDENTITY, (0.0,) * len(asset.joints))
             yield
+
+    def warm_up_pairs(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
+        """Look around the verified poses for the objects and supports of each table, one pair per step. Changes no answer.
+
+        Only the unchanged scene is looked at.
+        """
+        for table in tables:
+            for target in self._supports(table):
+                for held in self._movable(table):
+                    if not self._engine.state_bytes():
+                        self._look_around(held, target)
+                    yield
+
+    def look_into(self, target: str, tables: Iterable[Sequence[str]]) -> None:
+        """Look around the verified poses on a support of a scene in which only this support was opened."""
+        for table in tables:
+            if target in self._supports(table):
+                for held in self._movable(table):
+                    self._look_around(held, target)
+
+    def _movable(self, table: Sequence[str]) -> list[str]:
+        return [name for name in table if not self._scene.by_name[name].fixed]
+
+    def _supports(self, table: Sequence[str]) -> list[str]:
+        return [name for name in table if links_with_surfaces(self._scene.asset_of(name))]
+
+    def _look_around(self, held: str, target: str) -> None:
+        """Look around the verified poses of a pair now, and keep what was found for later states of the scene."""
+        engine, fractions = self._engine, self._scene.by_name[held].joints
+        for relation in PLACE_RELATIONS:
+            support = (target, relation, fractions, engine.joints(target))
+            for options in self.options.verified(held, target, relation):
+                if support not in options.as_loaded:
+                    frames = link_frames(engine, target, relation)
+                    found = loaded_places(engine, target, options.places, fractions, frames)
+                    options.as_loaded[support] = found
 
     def find(
         self,
@@ -94,7 +132,15 @@ class Placer:
             return fails
         reached = self._reached_in_set(held, target, relation)
         search = PlacementSearch(
-            self._engine, self._relations, self.options, held, target, relation, robot, excluded_stands
+            self._engine,
+            self._relations,
+            self.options,
+            self._moved,
+            held,
+            target,
+            relation,
+            robot,
+            excluded_stands,
         )
         poses = search.poses(rng, reached)
         found = self._first(most, held, poses if reached is not None else self._takeable_first(search, poses))
@@ -114,7 +160,7 @@ class Placer:
         try:
             for stand in stands:
                 search = PlacementSearch(
-                    self._engine, self._relations, self.options, held, target, relation, stand
+                    self._engine, self._relations, self.options, self._moved, held, target, relation, stand
                 )
                 answer = search.hindrance()
                 if answer[0] is FailureReason.NO_FREE_POSE:
@@ -137,7 +183,9 @@ class Placer:
         options = next(self.options.verified(held, target, relation), None)
         if options is None or held == target or not is_upright(self._engine.pose(target)):
             return ()
-        search = PlacementSearch(self._engine, self._relations, self.options, held, target, relation, robot)
+        search = PlacementSearch(
+            self._engine, self._relations, self.options, self._moved, held, target, relation, robot
+        )
         return self._first(most, held, search.accepted(options, range(len(options))))
 
     def _first(self, most: int, held: str, found: Iterator[T]) -> tuple[T, ...]:
@@ -146,8 +194,9 @@ class Placer:
         try:
             return tuple(itertools.islice(found, most))
         finally:
-            self._engine.set_pose(held, before)
-            self._engine.park(held)
+            if not self._engine.is_parked(held):
+                self._engine.set_pose(held, before)
+                self._engine.park(held)
 
     def _fits(self, held: str, target: str, relation: Relation) -> bool:
         """Return True if a pose exists when nothing else is there."""

@@ -1,6 +1,7 @@
 """Search for poses of one held object on, in or under another, in the engine's present state."""
 
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,10 +11,18 @@ import numpy as np
 
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M, PhysicsEngine
 from embomatrix.sim.floor.navigation import has_front
-from embomatrix.sim.geometry.batch_poses import BoolArray, Neighbours, PoseBoxes
+from embomatrix.sim.geometry.batch_poses import (
+    HANDY,
+    REACHED,
+    BoolArray,
+    Neighbours,
+    PoseBoxes,
+    Range,
+)
 from embomatrix.sim.geometry.behind_panels import behind_panels
 from embomatrix.sim.geometry.statics import is_level, rest_pose
 from embomatrix.sim.geometry.surfaces import is_shut, link_frame, links_with_surfaces
+from embomatrix.sim.placing.loaded_places import NOTHING_NEAR_M, LoadedPlaces, MovedObjects
 from embomatrix.sim.placing.options import CandidatePoses, PlacementOptions
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
@@ -48,6 +57,7 @@ class PlacementSearch:
     engine: PhysicsEngine
     relations: Relations
     options: PlacementOptions
+    moved: MovedObjects
     held: str
     target: str
     relation: Relation
@@ -71,10 +81,70 @@ class PlacementSearch:
 
     def accepted(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, Pose]]:
         """Accepted poses of a verified set, each with its number."""
+        known = self._known(options)
+        if known is not None:
+            yield from self._accepted_as_loaded(options, known, order)
+            return
         for number, nearest in self._roomy_first(options, order):
             found = self._verified(options.pose(number, self._frames), nearest)
             if found is not None:
                 yield number, found
+
+    def _known(self, options: CandidatePoses) -> LoadedPlaces | None:
+        """Places that were looked at in the scene as loaded, if the target has not moved and no reach is limited by its rim."""
+        engine, held, target = self.engine, self.held, self.target
+        known = options.as_loaded.get((target, self.relation, engine.joints(held), engine.joints(target)))
+        if known is None or self.excluded_stands or self._rises_over_rim:
+            return None
+        is_there = engine.pose(target) == engine.scene.by_name[target].pose_world_asset
+        return known if is_there else None
+
+    def _accepted_as_loaded(
+        self, options: CandidatePoses, known: LoadedPlaces, order: Sequence[int]
+    ) -> Iterator[tuple[int, Pose]]:
+        """Evaluate ``accepted`` with a target that has not moved: one place after the other, as most callers take the first."""
+        corners = known.corners_m.tolist()
+        reach, easy = Range.of(self.robot, *REACHED), Range.of(self.robot, *HANDY)
+        rows = [number for number in order if reach.includes(corners[number])]
+        if rows and any(self.engine.joints(self.target)):
+            served = self._served(known.boxes(slice(None)), self.robot).tolist()
+            rows = [number for number in rows if served[number]]
+        ignore = frozenset((self.held, self.target))
+        moved = self.moved.boxes(ignore) if rows else []
+        crowded: list[int] = []
+        for number in itertools.chain(
+            (number for number in rows if easy.includes(corners[number])),
+            (number for number in rows if not easy.includes(corners[number])),
+        ):
+            a, b, c, d, e, f = corners[number]
+            box = Aabb((a, b, c), (d, e, f))
+            is_lonely = known.lonely[number] and not any(box.overlaps(other, NOTHING_NEAR_M) for other in moved)
+            if not is_lonely and self.engine.near(box.grown(NEAR_M), ignore):
+                crowded.append(number)
+                continue
+            pose = options.pose(number, self._frames)
+            found = self._lonely(pose) if is_lonely else self._verified(pose, "")
+            if found is not None:
+                yield number, found
+        if crowded:
+            around = known.boxes(rows).around()
+            for number, nearest in self._least_crowded(known.boxes(crowded), crowded, around):
+                found = self._verified(options.pose(number, self._frames), nearest)
+                if found is not None:
+                    yield number, found
+
+    def _lonely(self, pose: Pose) -> Pose | None:
+        """Accept a pose that was verified, with nothing but its support near it."""
+        engine, held, target = self.engine, self.held, self.target
+        # The pose was verified with all joints shut: while they are, the object is free of its support.
+        if any((*engine.joints(target), *engine.joints(held))):
+            engine.set_pose(held, pose)
+            if self._is_deep(target):
+                return None
+        if self._holds(pose):
+            return pose
+        engine.set_pose(held, pose)
+        return self._settled()
 
     def _fresh(self, rng: np.random.Generator | None) -> Iterator[Pose]:
         """Poses for pairs that the analysis did not cover, and on surfaces that have filled up."""
@@ -135,7 +205,8 @@ class PlacementSearch:
         handy = boxes.handy_from(self.robot).tolist()
         rows.sort(key=lambda number: not handy[number])
         boxes = boxes.at(rows)
-        near = engine.near(boxes.around().grown(NEAR_M), frozenset((held, self.target)))
+        around = boxes.around()
+        near = engine.near(around.grown(NEAR_M), frozenset((held, self.target)))
         others = [engine.aabb(name) for name in near]
         crowded: list[int] = []
         for place, is_crowded in enumerate(boxes.crowded(others, NEAR_M)):
@@ -143,10 +214,17 @@ class PlacementSearch:
                 crowded.append(place)
             else:
                 yield rows[place], ""
-        if not crowded:
-            return
-        boxes, rows = boxes.at(crowded), [rows[place] for place in crowded]
-        taken, most = (answers.tolist() for answers in boxes.overlaps(_neighbours(engine, near)))
+        if crowded:
+            rows = [rows[place] for place in crowded]
+            yield from self._least_crowded(boxes.at(crowded), rows, around)
+
+    def _least_crowded(self, boxes: PoseBoxes, rows: Sequence[int], around: Aabb) -> Iterator[tuple[int, str]]:
+        """Crowded candidates that may be free, each with the object that it most likely meets.
+
+        ``around`` is the box around all candidates in reach.
+        """
+        near = self.engine.near(around.grown(NEAR_M), frozenset((self.held, self.target)))
+        taken, most = (answers.tolist() for answers in boxes.overlaps(_neighbours(self.engine, near)))
         for number, full, nearest in zip(rows, taken, most, strict=True):
             if not full:
                 yield number, near[nearest]
@@ -155,25 +233,23 @@ class PlacementSearch:
         """Tell for each box, shape (n,), if the arm reaches it over the target's rim and past its open doors."""
         engine, asset, fractions = self.engine, self._asset(self.target), self.engine.joints(self.target)
         reached = boxes.reached_from(stand)
-        rim_m = engine.aabb(self.target).high_m[2]
-        if self.relation is Relation.INSIDE and rim_m > HIGH_RIM_M and not has_front(asset):
-            reached &= boxes.raised_over(rim_m).reached_from(stand)
+        if self._rises_over_rim:
+            reached &= boxes.raised_over(engine.aabb(self.target).high_m[2]).reached_from(stand)
         if any(fractions):
-            reached &= ~behind_panels(boxes, asset, engine.pose(self.target), fractions, stand)
+            around = self.options.barriers[asset.asset_id, engine.pose(self.target), fractions]
+            if around:
+                reached &= ~behind_panels(boxes, around, stand)
         return reached
 
     @functools.cached_property
+    def _rises_over_rim(self) -> bool:
+        """Return True if the arm lifts the object over the target's rim, which limits its reach."""
+        rim_m = self.engine.aabb(self.target).high_m[2]
+        return self.relation is Relation.INSIDE and rim_m > HIGH_RIM_M and not has_front(self._asset(self.target))
+
+    @functools.cached_property
     def _frames(self) -> dict[str, Pose]:
-        """Frame of each link of the target that can carry objects; shut drawers are left out."""
-        asset = self._asset(self.target)
-        pose, fractions = self.engine.pose(self.target), self.engine.joints(self.target)
-        shut = {
-            item.link
-            for item in asset.interiors
-            if item.link and self.relation is Relation.INSIDE and is_shut(asset, item, fractions)
-        }
-        links = ({""} | links_with_surfaces(asset)) - shut
-        return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
+        return link_frames(self.engine, self.target, self.relation)
 
     def _asset(self, name: str) -> Asset:
         return self.engine.scene.asset_of(name)
@@ -222,14 +298,16 @@ class PlacementSearch:
             return None
         return settled.pose if self._holds() else None
 
-    def _holds(self) -> bool:
-        """Return True if the relation holds at the pose under trial."""
+    def _holds(self, pose: Pose | None = None) -> bool:
+        """Return True if the relation holds at ``pose``, or where the object is tried now."""
         match self.relation:
             case Relation.ONTOP:
-                return self.relations.supports.would_be_on(self.held, self.target)
+                return self.relations.supports.would_be_on(self.held, self.target, pose)
             case Relation.INSIDE:
-                return self.relations.supports.would_be_in(self.held, self.target)
+                return self.relations.supports.would_be_in(self.held, self.target, pose)
             case _:
+                if pose is not None:
+                    self.engine.set_pose(self.held, pose)
                 return self.relations.holds(self.relation, self.held, self.target)
 
     def _is_free(self, pose: Pose, nearest: str) -> bool:
@@ -243,6 +321,20 @@ class PlacementSearch:
 
     def _reaches(self) -> bool:
         return in_reach(self.engine.aabb(self.held), self.robot)
+
+
+def link_frames(engine: PhysicsEngine, target: str, relation: Relation) -> dict[str, Pose]:
+    """Frame of each link of the target that can carry objects; shut drawers are left out."""
+    asset, pose, fractions = engine.scene.asset_of(target), engine.pose(target), engine.joints(target)
+    if not fractions:
+        return {"": pose}
+    shut = {
+        item.link
+        for item in asset.interiors
+        if item.link and relation is Relation.INSIDE and is_shut(asset, item, fractions)
+    }
+    links = ({""} | links_with_surfaces(asset)) - shut
+    return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:

@@ -1,0 +1,74 @@
+"""Candidate places in the scene as loaded: what is near each of them, so that later only moved objects need a look."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from embomatrix.sim.engine import PhysicsEngine
+from embomatrix.sim.geometry.batch_poses import BoolArray, PoseBoxes, PoseSet
+from embomatrix.world.geometry import Aabb, FloatArray, Pose
+
+NOTHING_NEAR_M: Final = 0.02
+"""Boxes this far apart have nothing to do with each other: no test of a place looks further."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedPlaces:
+    """World boxes of candidate poses on a support that is as loaded.
+
+    ``corners_m`` has shape (n, 6): low corner, then high corner. ``lonely`` has a 1 for each pose with no wall and no object but
+    the support near it in the scene as loaded, else a 0.
+    """
+
+    corners_m: FloatArray
+    lonely: bytes
+
+    def boxes(self, rows: list[int] | slice) -> PoseBoxes:
+        """Boxes of some of the poses, in the order of ``rows``."""
+        return PoseBoxes(self.corners_m[rows, :3], self.corners_m[rows, 3:])
+
+
+def loaded_places(
+    engine: PhysicsEngine,
+    target: str,
+    places: PoseSet,
+    fractions: tuple[float, ...],
+    frames: Mapping[str, Pose],
+) -> LoadedPlaces:
+    """Look around each pose of an object with these joint positions. ``engine`` holds the scene as loaded."""
+    boxes = places.world_boxes(fractions, frames)
+    corners = np.concatenate([boxes.lows_m, boxes.highs_m], axis=1)  # (n, 6)
+    found = np.flatnonzero(np.isfinite(corners[:, 0]))
+    lonely: BoolArray = np.ones(len(corners), dtype=np.bool_)
+    if len(found):
+        around = PoseBoxes(boxes.lows_m[found], boxes.highs_m[found]).around().grown(NOTHING_NEAR_M)
+        near = [engine.aabb(name) for name in engine.near(around, frozenset((target,)))]
+        if near:
+            others = np.array([(*box.low_m, *box.high_m) for box in near])  # (k, 6)
+            above = (corners[:, None, 3:] + NOTHING_NEAR_M >= others[:, :3]).all(axis=2)
+            below = (corners[:, None, :3] - NOTHING_NEAR_M <= others[:, 3:]).all(axis=2)
+            lonely = np.asarray(~np.any(above & below, axis=1))
+        if engine.is_at_wall(around):
+            lonely = lonely & [not engine.is_at_wall(box.grown(NOTHING_NEAR_M)) for box in boxes.each()]
+    return LoadedPlaces(corners, lonely.tobytes())
+
+
+class MovedObjects:
+    """Objects of an engine that may not be as loaded, from its journal."""
+
+    def __init__(self, engine: PhysicsEngine) -> None:
+        self._engine = engine
+        self._names: set[str] = set()
+        self._round, self._read = -1, 0
+
+    def boxes(self, ignore: frozenset[str]) -> list[Aabb]:
+        """Boxes of the moved objects in the world but these."""
+        engine, journal = self._engine, self._engine.journal
+        if journal.rounds != self._round:
+            self._names.clear()
+            self._round, self._read = journal.rounds, 0
+        self._names.update([name for name, _ in journal.entries[self._read :]])
+        self._read = len(journal.entries)
+        return [engine.aabb(name) for name in self._names - ignore if not engine.is_parked(name)]
