@@ -227,6 +227,14 @@ class LiveWorld:
         self._changes_since.read()
         return (*self.thermal.apply(self._changes_since), *self.water.apply(self._changes_since))
 
+    def is_untouched(self, name: str) -> bool:
+        """Return True if the object, its place and its states are certainly those at the start."""
+        return (
+            self.relations.supports.are_untouched((name,))
+            and self.states.is_untouched(name)
+            and self.substances.is_untouched(name)
+        )
+
     @property
     def carried(self) -> tuple[str, ...]:
         """Held object, then its contents; empty for an empty hand."""

@@ -247,7 +247,7 @@ class Navigator:
 
     def is_as_loaded(self, name: str) -> bool:
         """Return True if the object and its hosts are where the scene has them."""
-        return all(
+        return self._relations.are_untouched(name) or all(
             self._engine.pose(item) == self._scene.by_name[item].pose_world_asset
             for item in (name, *self._relations.hosts_of(name))
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -87,12 +87,20 @@ class SupportTracker:
         """Support of an object."""
         return self._cache_of(name)[name]
 
+    def are_untouched(self, names: Iterable[str]) -> bool:
+        """Return True if none of these objects changed since loading, nor anything that their support depends on."""
+        self._catch_up()
+        return self._stale.isdisjoint(names)
+
     def _cache_of(self, name: str) -> BoundedCache[str, SupportState]:
         """Cache for the object's state, after the journal is read."""
+        self._catch_up()
+        return self._now if name in self._stale else self._at_start
+
+    def _catch_up(self) -> None:
         journal = self._engine.journal
         if len(journal.entries) != self._read or journal.rounds != self._round:
             self._read_journal()
-        return self._now if name in self._stale else self._at_start
 
     def warm_up(self) -> Iterator[None]:
         """Compute the support of every object, one per step. Changes no answer."""
