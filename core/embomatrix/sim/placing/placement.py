@@ -9,7 +9,7 @@ import numpy as np
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import bounds_of
-from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, candidates
+from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, YAWS, candidates
 from embomatrix.sim.geometry.surfaces import is_upright, links_with_surfaces
 from embomatrix.sim.placing.loaded_places import MovedObjects, loaded_places
 from embomatrix.sim.placing.options import PlacementOptions
@@ -56,6 +56,8 @@ class Placer:
             if asset_id in movable:
                 self.options.footprints[asset_id]
                 self.options.bases[asset_id]
+                for yaw in YAWS:
+                    bounds_of(asset).box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw))
                 yield
             bounds_of(asset).part_boxes(IDENTITY, (0.0,) * len(asset.joints))
             yield

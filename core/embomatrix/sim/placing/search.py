@@ -1,7 +1,6 @@
 """Search for poses of one held object on, in or under another, in the engine's present state."""
 
 import functools
-import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -105,17 +104,26 @@ class PlacementSearch:
         """Evaluate ``accepted`` with a target that has not moved: one place after the other, as most callers take the first."""
         corners = known.corners_m.tolist()
         reach, easy = Range.of(self.robot, *REACHED), Range.of(self.robot, *HANDY)
-        rows = [number for number in order if reach.includes(corners[number])]
-        if rows and any(self.engine.joints(self.target)):
+        if any(self.engine.joints(self.target)):
             served = self._served(known.boxes(slice(None)), self.robot).tolist()
-            rows = [number for number in rows if served[number]]
+            order = [number for number in order if served[number]]
+        reached: list[int] = []
+
+        def handy_first() -> Iterator[int]:
+            others: list[int] = []
+            for number in order:
+                if reach.includes(corners[number]):
+                    reached.append(number)
+                    if easy.includes(corners[number]):
+                        yield number
+                    else:
+                        others.append(number)
+            yield from others
+
         ignore = frozenset((self.held, self.target))
-        moved = self.moved.boxes(ignore) if rows else []
+        moved = self.moved.boxes(ignore)
         crowded: list[int] = []
-        for number in itertools.chain(
-            (number for number in rows if easy.includes(corners[number])),
-            (number for number in rows if not easy.includes(corners[number])),
-        ):
+        for number in handy_first():
             a, b, c, d, e, f = corners[number]
             box = Aabb((a, b, c), (d, e, f))
             is_lonely = known.lonely[number] and not any(box.overlaps(other, NOTHING_NEAR_M) for other in moved)
@@ -127,7 +135,7 @@ class PlacementSearch:
             if found is not None:
                 yield number, found
         if crowded:
-            around = known.boxes(rows).around()
+            around = known.boxes(reached).around()
             for number, nearest in self._least_crowded(known.boxes(crowded), crowded, around):
                 found = self._verified(options.pose(number, self._frames), nearest)
                 if found is not None:
