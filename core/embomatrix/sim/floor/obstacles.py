@@ -114,7 +114,10 @@ class Obstacles:
         low, top = box.low_m[2], box.high_m[2]
         crossed: list[list[float]] = []
         for row, owner, is_panel in zip(
-            self.boxes[found].tolist(), self.owners[found].tolist(), self.is_panel[found].tolist(), strict=True
+            self.boxes[found].tolist(),
+            self.owners[found].tolist(),
+            self.is_panel[found].tolist(),
+            strict=True,
         ):
             if owner == own[0]:
                 continue

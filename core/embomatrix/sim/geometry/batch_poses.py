@@ -66,16 +66,29 @@ class PoseBoxes:
         (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()
         return Aabb((a, b, c), (d, e, f))
 
+    def finite(self) -> PoseBoxes:
+        """Boxes of the valid poses."""
+        valid = np.isfinite(self.lows_m[:, 0])
+        return self if valid.all() else PoseBoxes(self.lows_m[valid], self.highs_m[valid])
+
+    def meet(self, others: Sequence[Aabb], margin_m: float) -> BoolArray:
+        """Tell for each box, shape (n,), if it overlaps any other one within a margin."""
+        if not others:
+            return np.zeros(len(self.lows_m), dtype=np.bool_)
+        lows, highs = (np.array([box.low_m for box in others]), np.array([box.high_m for box in others]))
+        near = (self.lows_m[:, None] - margin_m <= highs) & (
+            lows <= self.highs_m[:, None] + margin_m
+        )  # (n, k, 3)
+        return np.asarray((near[..., 0] & near[..., 1] & near[..., 2]).any(axis=1))
+
     def each(self) -> Iterator[Aabb]:
         """Yield them one by one."""
         for (a, b, c), (d, e, f) in zip(self.lows_m.tolist(), self.highs_m.tolist(), strict=True):
             yield Aabb((a, b, c), (d, e, f))
 
-    def crowded(self, others: Sequence[Aabb], margin_m: float) -> Iterator[bool]:
-        """Tell box by box if it overlaps any other one within a margin. Lazy: most callers take the first few."""
-        for box in self.each():
-            grown = box.grown(margin_m)
-            yield any(grown.overlaps(other) for other in others)
+    def corners(self) -> list[list[float]]:
+        """Return the low and then the high corner of each."""
+        return np.concatenate([self.lows_m, self.highs_m], axis=1).tolist()  # type: ignore[no-any-return]  # six floats each
 
     def at(self, rows: Sequence[int]) -> PoseBoxes:
         """Some of the poses, in the order of ``rows``."""
@@ -90,10 +103,6 @@ class PoseBoxes:
     def reached_from(self, stand: StandPose) -> BoolArray:
         """Tell for each box, shape (n,), if the arm reaches its nearest point in the plane and the height of its middle."""
         return self._within(stand, *REACHED)
-
-    def handy_from(self, stand: StandPose) -> BoolArray:
-        """Return for each box, shape (n,), True if it is easy to reach: neither far out nor near the floor or overhead."""
-        return self._within(stand, *HANDY)
 
     def _within(self, stand: StandPose, away_m: float, low_m: float, high_m: float) -> BoolArray:
         base = np.array((stand.x_m, stand.y_m))

@@ -8,7 +8,7 @@ import numpy as np
 
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.geometry.batch_poses import BoolArray, PoseBoxes, PoseSet
-from embomatrix.world.geometry import Aabb, FloatArray, Pose
+from embomatrix.world.geometry import Aabb, Pose
 
 NOTHING_NEAR_M: Final = 0.02
 """Boxes this far apart have nothing to do with each other: no test of a place looks further."""
@@ -16,18 +16,13 @@ NOTHING_NEAR_M: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class LoadedPlaces:
-    """World boxes of candidate poses on a support that is as loaded.
+    """World boxes of n candidate poses on a support that is as loaded.
 
-    ``corners_m`` has shape (n, 6): low corner, then high corner. ``lonely`` has a 1 for each pose with no wall and no object but
-    the support near it in the scene as loaded, else a 0.
+    ``lonely`` has a 1 for each pose with no wall and no object but the support near it in the scene as loaded, else a 0.
     """
 
-    corners_m: FloatArray
+    boxes: PoseBoxes
     lonely: bytes
-
-    def boxes(self, rows: list[int] | slice) -> PoseBoxes:
-        """Boxes of some of the poses, in the order of ``rows``."""
-        return PoseBoxes(self.corners_m[rows, :3], self.corners_m[rows, 3:])
 
 
 def loaded_places(
@@ -39,20 +34,15 @@ def loaded_places(
 ) -> LoadedPlaces:
     """Look around each pose of an object with these joint positions. ``engine`` holds the scene as loaded."""
     boxes = places.world_boxes(fractions, frames)
-    corners = np.concatenate([boxes.lows_m, boxes.highs_m], axis=1)  # (n, 6)
-    found = np.flatnonzero(np.isfinite(corners[:, 0]))
-    lonely: BoolArray = np.ones(len(corners), dtype=np.bool_)
-    if len(found):
-        around = PoseBoxes(boxes.lows_m[found], boxes.highs_m[found]).around().grown(NOTHING_NEAR_M)
-        near = [engine.aabb(name) for name in engine.near(around, frozenset((target,)))]
-        if near:
-            others = np.array([(*box.low_m, *box.high_m) for box in near])  # (k, 6)
-            above = (corners[:, None, 3:] + NOTHING_NEAR_M >= others[:, :3]).all(axis=2)
-            below = (corners[:, None, :3] - NOTHING_NEAR_M <= others[:, 3:]).all(axis=2)
-            lonely = np.asarray(~np.any(above & below, axis=1))
+    lonely: BoolArray = np.ones(len(boxes.lows_m), dtype=np.bool_)
+    valid = boxes.finite()
+    if len(valid.lows_m):
+        around = valid.around().grown(NOTHING_NEAR_M)
+        others = [engine.aabb(name) for name in engine.near(around, frozenset((target,)))]
+        lonely = ~boxes.meet(others, NOTHING_NEAR_M)
         if engine.is_at_wall(around):
-            lonely = lonely & [not engine.is_at_wall(box.grown(NOTHING_NEAR_M)) for box in boxes.each()]
-    return LoadedPlaces(corners, lonely.tobytes())
+            lonely &= [not engine.is_at_wall(box.grown(NOTHING_NEAR_M)) for box in boxes.each()]
+    return LoadedPlaces(boxes, lonely.tobytes())
 
 
 class MovedObjects:

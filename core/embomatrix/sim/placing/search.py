@@ -2,7 +2,7 @@
 
 import functools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -45,6 +45,10 @@ HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
 """Highest rim over which the arm lifts any object it can hold."""
 
 
+Corner = Sequence[float]
+"""Low corner of a box, then its high corner."""
+
+
 @dataclass(frozen=True)
 class PlacementSearch:
     """Search for poses of an object with a relation to a target, in reach of a standing pose.
@@ -80,66 +84,19 @@ class PlacementSearch:
 
     def accepted(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, Pose]]:
         """Accepted poses of a verified set, each with its number."""
-        known = self._known(options)
-        if known is not None:
-            yield from self._accepted_as_loaded(options, known, order)
-            return
         for number, nearest in self._roomy_first(options, order):
-            found = self._verified(options.pose(number, self._frames), nearest)
+            pose = options.pose(number, self._frames)
+            found = self._lonely(pose) if nearest is None else self._verified(pose, nearest)
             if found is not None:
                 yield number, found
 
     def _known(self, options: CandidatePoses) -> LoadedPlaces | None:
-        """Places that were looked at in the scene as loaded, if the target has not moved and no reach is limited by its rim."""
+        """Places that were looked at in the scene as loaded, if the target has not moved since."""
         engine, held, target = self.engine, self.held, self.target
         known = options.as_loaded.get((target, self.relation, engine.joints(held), engine.joints(target)))
-        if known is None or self.excluded_stands or self._rises_over_rim:
+        if known is None or engine.pose(target) != engine.scene.by_name[target].pose_world_asset:
             return None
-        is_there = engine.pose(target) == engine.scene.by_name[target].pose_world_asset
-        return known if is_there else None
-
-    def _accepted_as_loaded(
-        self, options: CandidatePoses, known: LoadedPlaces, order: Sequence[int]
-    ) -> Iterator[tuple[int, Pose]]:
-        """Evaluate ``accepted`` with a target that has not moved: one place after the other, as most callers take the first."""
-        corners = known.corners_m.tolist()
-        reach, easy = Range.of(self.robot, *REACHED), Range.of(self.robot, *HANDY)
-        if any(self.engine.joints(self.target)):
-            served = self._served(known.boxes(slice(None)), self.robot).tolist()
-            order = [number for number in order if served[number]]
-        reached: list[int] = []
-
-        def handy_first() -> Iterator[int]:
-            others: list[int] = []
-            for number in order:
-                if reach.includes(corners[number]):
-                    reached.append(number)
-                    if easy.includes(corners[number]):
-                        yield number
-                    else:
-                        others.append(number)
-            yield from others
-
-        ignore = frozenset((self.held, self.target))
-        moved = self.moved.boxes(ignore)
-        crowded: list[int] = []
-        for number in handy_first():
-            a, b, c, d, e, f = corners[number]
-            box = Aabb((a, b, c), (d, e, f))
-            is_lonely = known.lonely[number] and not any(box.overlaps(other, NOTHING_NEAR_M) for other in moved)
-            if not is_lonely and self.engine.near(box.grown(NEAR_M), ignore):
-                crowded.append(number)
-                continue
-            pose = options.pose(number, self._frames)
-            found = self._lonely(pose) if is_lonely else self._verified(pose, "")
-            if found is not None:
-                yield number, found
-        if crowded:
-            around = known.boxes(reached).around()
-            for number, nearest in self._least_crowded(known.boxes(crowded), crowded, around):
-                found = self._verified(options.pose(number, self._frames), nearest)
-                if found is not None:
-                    yield number, found
+        return known
 
     def _lonely(self, pose: Pose) -> Pose | None:
         """Accept a pose that was verified, with nothing but its support near it."""
@@ -164,7 +121,8 @@ class PlacementSearch:
                 return
             found = self._proved(options, number)
             if found is None:
-                if not self._is_free(options.pose(number, self._frames), nearest) or not self._holds():
+                pose = options.pose(number, self._frames)
+                if not self._is_free(pose, nearest or "") or not self._holds():
                     continue
                 settles += 1
                 found = self._settled()
@@ -193,49 +151,83 @@ class PlacementSearch:
         others = sorted(met.keys() - {"", self.target})
         return FailureReason.NO_FREE_POSE, max(others, key=lambda name: met[name], default="")
 
-    def _roomy_first(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, str]]:
+    def _roomy_first(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, str | None]]:
         """Candidates in reach: first those with nothing but the target around, then the others; handy ones lead each group.
 
-        Each of the others comes with the object it most likely meets. This coarse test uses boxes only; candidates that
-        certainly collide are left out.
+        Each of the others comes with the object it most likely meets, and the first ones with "", or None if no wall is near
+        either. This coarse test uses boxes only; candidates that certainly collide are left out. They are tested one after the
+        other, because most callers take the first.
         """
         if not order:
             return
-        engine, held = self.engine, self.held
-        boxes = options.places.world_boxes(engine.joints(held), self._frames)
-        reached = self._served(boxes, self.robot)
-        for stand in self.excluded_stands:
-            reached &= ~self._served(boxes, stand)
-        flags = reached.tolist()
-        rows = [number for number in order if flags[number]]
-        if not rows:
-            return
-        handy = boxes.handy_from(self.robot).tolist()
-        rows.sort(key=lambda number: not handy[number])
-        boxes = boxes.at(rows)
-        around = boxes.around()
-        near = engine.near(around.grown(NEAR_M), frozenset((held, self.target)))
-        others = [engine.aabb(name) for name in near]
+        known, ignore = self._known(options), frozenset((self.held, self.target))
+        if known is not None:
+            boxes, is_crowded = known.boxes, self._crowding(known, ignore)
+        else:
+            boxes = options.places.world_boxes(self.engine.joints(self.held), self._frames)
+            is_crowded = self._crowding_of(boxes, ignore)
+        rows: list[int] = []
         crowded: list[int] = []
-        for place, is_crowded in enumerate(boxes.crowded(others, NEAR_M)):
-            if is_crowded:
-                crowded.append(place)
+        for number, corner in self._handy_first(boxes, order, rows):
+            found = is_crowded(number, corner)
+            if found:
+                crowded.append(number)
             else:
-                yield rows[place], ""
-        if crowded:
-            rows = [rows[place] for place in crowded]
-            yield from self._least_crowded(boxes.at(crowded), rows, around)
-
-    def _least_crowded(self, boxes: PoseBoxes, rows: Sequence[int], around: Aabb) -> Iterator[tuple[int, str]]:
-        """Crowded candidates that may be free, each with the object that it most likely meets.
-
-        ``around`` is the box around all candidates in reach.
-        """
-        near = self.engine.near(around.grown(NEAR_M), frozenset((self.held, self.target)))
-        taken, most = (answers.tolist() for answers in boxes.overlaps(_neighbours(self.engine, near)))
-        for number, full, nearest in zip(rows, taken, most, strict=True):
+                yield number, None if found is None else ""
+        if not crowded:
+            return
+        near = self.engine.near(boxes.at(rows).around().grown(NEAR_M), ignore)
+        taken, most = boxes.at(crowded).overlaps(_neighbours(self.engine, near))
+        for number, full, nearest in zip(crowded, taken.tolist(), most.tolist(), strict=True):
             if not full:
                 yield number, near[nearest]
+
+    def _crowding(self, known: LoadedPlaces, ignore: frozenset[str]) -> Callable[[int, Corner], bool | None]:
+        """Return a test of one place for objects around it. It answers None if no wall is near either."""
+        lonely, moved, near = known.lonely, self.moved.boxes(ignore), self.engine.near
+
+        def is_crowded(number: int, corner: Corner) -> bool | None:
+            a, b, c, d, e, f = corner
+            box = Aabb((a, b, c), (d, e, f))
+            if lonely[number] and not any(box.overlaps(other, NOTHING_NEAR_M) for other in moved):
+                return None
+            return bool(near(box.grown(NEAR_M), ignore))
+
+        return is_crowded
+
+    def _crowding_of(self, boxes: PoseBoxes, ignore: frozenset[str]) -> Callable[[int, Corner], bool]:
+        """Return a test of one place for objects around it, which looks at all places at once."""
+        valid = boxes.finite()
+        if not len(valid.lows_m):
+            return lambda number, corner: False
+        near = self.engine.near(valid.around().grown(NEAR_M), ignore)
+        crowded = boxes.meet([self.engine.aabb(name) for name in near], NEAR_M).tolist()
+        return lambda number, corner: bool(crowded[number])
+
+    def _handy_first(
+        self, boxes: PoseBoxes, order: Sequence[int], rows: list[int]
+    ) -> Iterator[tuple[int, Corner]]:
+        """Numbers and corners of the boxes in reach, handy ones first. ``rows`` receives the numbers as they are tested."""
+        stands = (self.robot, *self.excluded_stands)
+        if self._rises_over_rim or len(stands) > 1 or any(self.engine.joints(self.target)):
+            reached, *excluded = (self._served(boxes, stand) for stand in stands)
+            for other in excluded:
+                reached &= ~other
+            served = reached.tolist()
+            order = [number for number in order if served[number]]
+        corners = boxes.corners()
+        reach, easy = Range.of(self.robot, *REACHED), Range.of(self.robot, *HANDY)
+        others: list[int] = []
+        for number in order:
+            corner = corners[number]
+            if reach.includes(corner):
+                rows.append(number)
+                if easy.includes(corner):
+                    yield number, corner
+                else:
+                    others.append(number)
+        for number in others:
+            yield number, corners[number]
 
     def _served(self, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
         """Tell for each box, shape (n,), if the arm reaches it over the target's rim and past its open doors."""
@@ -253,7 +245,11 @@ class PlacementSearch:
     def _rises_over_rim(self) -> bool:
         """Return True if the arm lifts the object over the target's rim, which limits its reach."""
         rim_m = self.engine.aabb(self.target).high_m[2]
-        return self.relation is Relation.INSIDE and rim_m > HIGH_RIM_M and not has_front(self._asset(self.target))
+        return (
+            self.relation is Relation.INSIDE
+            and rim_m > HIGH_RIM_M
+            and not has_front(self._asset(self.target))
+        )
 
     @functools.cached_property
     def _frames(self) -> dict[str, Pose]:
