@@ -141,22 +141,23 @@ class Navigator:
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
             return
-        grid = self.ground.grid
-        if grid is self.ground.shut:
+        ground, grid = self.ground, self.ground.grid
+        if grid is ground.shut:
             yield from self._stands_on_shut(name, start)
             return
         label = grid.label(start)
-        if self.ground.numbers[name] in dict(self.ground.open_joints):
-            yield from self._stands[self._key(name), self.ground.open_joints, label]
+        number = ground.numbers[name]
+        if any(number == other for other, _ in ground.open_joints):
+            yield from self._stands[self._key(name), ground.open_joints, label]
             return
-        shut = self.stands_past_shut(name, StandPose(*grid.center(start), 0.0))
         found = False
-        for stand in shut:
+        # A cell that is free with panels open is free with all panels shut.
+        for stand in self._stands_on_shut(name, start):
             if grid.label_at(stand.x_m, stand.y_m) == label:
                 found = True
                 yield stand
         if not found:
-            yield from self._stands[self._key(name), self.ground.open_joints, label]
+            yield from self._stands[self._key(name), ground.open_joints, label]
 
     def stands_past_shut(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
         """Evaluate ``stands`` as if all doors and drawers were shut: few panels block any of these places."""

@@ -106,6 +106,8 @@ def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArr
 
 def spread_over(centers_m: FloatArray, rooms_m: FloatArray, shift: Vec2, tries: int) -> FloatArray:
     """Evaluate ``proposed_places`` for patches given by their centres, shape (p, 3), and rooms, shape (p, 2)."""
+    if not len(centers_m):
+        return np.zeros((0, 3))
     rows = np.arange(tries) % len(centers_m)
     places = centers_m[rows]  # (n, 3)
     spread = (np.array(shift) + np.arange(1, tries + 1)[:, None] * np.array(GOLDEN)) % 1.0

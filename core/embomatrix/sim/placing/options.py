@@ -4,16 +4,18 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
+
 from embomatrix.sim.caches import BoundedCache
 from embomatrix.sim.geometry.batch_poses import PoseSet
 from embomatrix.sim.geometry.behind_panels import Barrier, barriers
 from embomatrix.sim.geometry.bounds import ASSETS_KEPT, bounds_of
-from embomatrix.sim.geometry.candidates import Patch, patches, proposed_places
+from embomatrix.sim.geometry.candidates import patches, spread_over
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.geometry.statics import Base, base_of
 from embomatrix.sim.geometry.surfaces import link_under, links_with_surfaces
 from embomatrix.sim.placing.loaded_places import LoadedPlaces
-from embomatrix.world.geometry import IDENTITY, Pose, Vec2
+from embomatrix.world.geometry import IDENTITY, FloatArray, Pose, Vec2
 from embomatrix.world.placements import pose_rows, rows_of
 from embomatrix.world.poses import PlacementKey, PoseCache
 from embomatrix.world.scene import Scene
@@ -49,6 +51,16 @@ class CandidatePoses:
         return self.places.links[int(self.places.link_of[number])]
 
 
+@dataclass(frozen=True, slots=True)
+class PatchSet:
+    """Patches for a pair as arrays, centres of shape (p, 3) and rooms of shape (p, 2), and the poses in their middles."""
+
+    centers_m: FloatArray
+    rooms_m: FloatArray
+    yaws: tuple[float, ...]
+    middles: PoseSet
+
+
 class PlacementOptions:
     """Candidate poses from a pose cache and from the surfaces of a scene's assets."""
 
@@ -75,14 +87,20 @@ class PlacementOptions:
 
     def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> CandidatePoses:
         """Return up to ``tries`` poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
-        found, middles = self._patches[self._key(held, target, relation)]
-        points = proposed_places(found, shift, tries)
+        found = self._patches[self._key(held, target, relation)]
+        yaws, points = found.yaws, spread_over(found.centers_m, found.rooms_m, shift, tries)
 
         def exact(number: int) -> Pose:
             x, y, z = points[number].tolist()
-            return Pose.from_xyz_yaw(x, y, z, found[number % len(found)].yaw)
+            return Pose.from_xyz_yaw(x, y, z, yaws[number % len(yaws)])
 
-        return CandidatePoses(middles.repeated_at(points), exact)
+        return CandidatePoses(found.middles.repeated_at(points), exact)
+
+    def warm_up_fresh(self, held: str, target: str, relation: Relation) -> None:
+        """Prepare fresh poses for a pair in the scene as loaded. Changes no answer."""
+        objects = self._scene.by_name
+        middles = self._patches[self._key(held, target, relation)].middles
+        middles.extents[objects[target].pose_world_asset.quat_xyzw, objects[held].joints]
 
     def _key(self, held: str, target: str, relation: Relation) -> PlacementKey:
         objects = self._scene.by_name
@@ -114,12 +132,16 @@ class PlacementOptions:
 
         return CandidatePoses(places, exact)
 
-    def _find_patches(self, key: PlacementKey) -> tuple[tuple[Patch, ...], PoseSet]:
-        """Patches for a pair, and the poses in their middles."""
+    def _find_patches(self, key: PlacementKey) -> PatchSet:
         bounds = bounds_of(self._scene.assets[key.asset_id])
         found = patches(bounds, self._scene.assets[key.support_asset_id], key.relation)
         middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
-        return found, PoseSet.of(bounds, pose_rows(middles), [patch.link for patch in found])
+        return PatchSet(
+            np.array([patch.center_m for patch in found]).reshape(-1, 3),
+            np.array([patch.room_m for patch in found]).reshape(-1, 2),
+            tuple(patch.yaw for patch in found),
+            PoseSet.of(bounds, pose_rows(middles), [patch.link for patch in found]),
+        )
 
     def _find_barriers(self, key: tuple[str, Pose, tuple[float, ...]]) -> tuple[Barrier, ...]:
         asset_id, pose, fractions = key

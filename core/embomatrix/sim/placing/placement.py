@@ -65,14 +65,22 @@ class Placer:
     def warm_up_pairs(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
         """Look around the verified poses for the objects and supports of each table, one pair per step. Changes no answer.
 
-        Only the unchanged scene is looked at.
+        Only the unchanged scene is looked at. Fresh poses for the pairs without verified ones follow.
         """
-        for table in tables:
-            for target in self._supports(table):
-                for held in self._movable(table):
-                    if not self._engine.state_bytes():
-                        self._look_around(held, target)
-                    yield
+        pairs = [
+            (held, target)
+            for table in tables
+            for target in self._supports(table)
+            for held in self._movable(table)
+        ]
+        for held, target in pairs:
+            if not self._engine.state_bytes():
+                self._look_around(held, target)
+            yield
+        for (held, target), relation in itertools.product(pairs, (Relation.ONTOP, Relation.INSIDE)):
+            if not self.has_verified(held, target, relation):
+                self.options.warm_up_fresh(held, target, relation)
+                yield
 
     def look_into(self, target: str, tables: Iterable[Sequence[str]]) -> None:
         """Look around the verified poses on a support of a scene in which only this support was opened."""
