@@ -10,8 +10,9 @@ from embomatrix.sim.floor.obstacles import WALLS, Obstacles
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.state import OPEN_FRACTION
 
-OpenJoints = tuple[tuple[int, tuple[float, ...]], ...]
-"""Fixed objects with an open panel: number in the scene and joint positions."""
+OpenJoint = tuple[int, tuple[float, ...]]
+"""Fixed object with an open panel: number in the scene and joint positions."""
+OpenJoints = tuple[OpenJoint, ...]
 
 
 class OpenPanels:
