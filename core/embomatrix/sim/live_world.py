@@ -151,6 +151,8 @@ class LiveWorld:
         self.table: tuple[str, ...] = ()
         self.rooms = tuple(room.name for room in self.scene.rooms)
         self.robot = self.navigator.start
+        self._robot_text: tuple[StandPose | None, str] = (None, "")
+        """Robot's pose in the last ``state_bytes``, and its text: half of the calls do not move the robot."""
         for item in self.scene.objects:
             self.states[item.name] = set(item.states & SYMBOLIC)
             self.substances[item.name] = set(facts_of(item.states, item.substances))
@@ -304,8 +306,10 @@ class LiveWorld:
 
     def state_bytes(self) -> bytes:
         """Differences of the engine's and the symbolic state from the scene's start, plus the robot and the hand."""
-        robot, carried = self.robot, " ".join(self.hand.carried)
-        lines = [f"{robot.x_m.hex()} {robot.y_m.hex()} {robot.yaw.hex()}\n{carried}"]
+        robot = self.robot
+        if robot is not self._robot_text[0]:
+            self._robot_text = robot, f"{robot.x_m.hex()} {robot.y_m.hex()} {robot.yaw.hex()}\n"
+        lines = [self._robot_text[1] + " ".join(self.hand.carried)]
         for name, states in self.states.changed():
             lines.append(f"{name}:{','.join(sorted(states))}")
         for name, treated in self.treatments.changed():

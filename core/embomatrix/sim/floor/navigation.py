@@ -61,6 +61,8 @@ class Navigator:
         self._stands = BoundedCache(ANSWERS_KEPT, self._find_stands)
         self._asides = BoundedCache(ANSWERS_KEPT, self._find_aside)
         self._blockers = BoundedCache(ANSWERS_KEPT, self._find_blockers)
+        self._blockers_at_start: dict[str, FloatArray] = {}
+        """Blockers of objects that are as loaded, by name: a look-up costs less than by all that they depend on."""
         self._found_before = stands if stands is not None else {}
 
     def refresh(self) -> None:
@@ -221,7 +223,7 @@ class Navigator:
     def warm_up(self) -> Iterator[None]:
         """Compute the obstacles of the arm to each object, and the grids with open doors, one per step. Changes no answer."""
         for item in self._scene.objects:
-            self._blockers[self._key(item.name)]
+            self._near_blockers_of(item.name)
             yield
         yield from self.ground.warm_up()
 
@@ -231,15 +233,15 @@ class Navigator:
         fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
         yaw = self._engine.pose(fixed[0] if fixed else name).yaw
         from_front = has_front(self._scene.asset_of(name))
-        return StandingArea(self._relations.body(name), yaw, from_front, self._blockers[self._key(name)])
+        return StandingArea(self._relations.body(name), yaw, from_front, self._near_blockers_of(name))
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Return True if no wall nor anything much taller than the object stands between it and the robot."""
         box = self._relations.body(name)
         here, nearest = _line(origin, box)
-        near = math.dist(here, nearest) <= ROBOT.reach_m
-        blockers = self._blockers[self._key(name)] if near else self._all_blockers_of(name)
-        return not crosses(here, nearest, blockers)
+        if math.dist(here, nearest) > ROBOT.reach_m:
+            return not crosses(here, nearest, self._all_blockers_of(name))
+        return not crosses(here, nearest, self._near_blockers_of(name))
 
     def line_would_be_clear(self, origin: StandPose, box: Aabb, own: Iterable[str]) -> bool:
         """Evaluate ``line_is_clear`` for an object that is not there yet: ``own`` are its name and its would-be hosts."""
@@ -257,6 +259,15 @@ class Navigator:
         """Rectangles within reach of an object that block the arm on its way to it, shape (4, n)."""
         _, name, *_ = key
         return _within_reach(self._all_blockers_of(name), self._relations.body(name))
+
+    def _near_blockers_of(self, name: str) -> FloatArray:
+        """Rectangles within reach of an object that block the arm on its way to it, shape (4, n)."""
+        if self.ground.floor or not self._relations.are_untouched(name):
+            return self._blockers[self._key(name)]
+        known = self._blockers_at_start.get(name)
+        if known is None:
+            known = self._blockers_at_start[name] = self._blockers[self._key(name)]
+        return known
 
     def _all_blockers_of(self, name: str) -> FloatArray:
         return self.ground.obstacles.blockers(self._relations.body(name), self._own(name))
