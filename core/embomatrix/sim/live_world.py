@@ -218,8 +218,8 @@ class LiveWorld:
             self.navigator.refresh()
             if before is not None:
                 self.navigator.step_aside(name, before)
-                self.navigator.nearest_stand(name, before)
-            self.placer.look_into(name, tables)
+                beside = self.navigator.nearest_stand(name, before)
+                self.placer.look_into(name, tables, beside or before)
             self.engine.reset()
             self.navigator.refresh()
             yield

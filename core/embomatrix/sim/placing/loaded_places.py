@@ -1,7 +1,7 @@
 """Candidate places in the scene as loaded: what is near each of them, so that later only moved objects need a look."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.geometry.batch_poses import BoolArray, PoseBoxes, PoseSet
 from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.poses import StandPose
 
 NOTHING_NEAR_M: Final = 0.02
 """Boxes this far apart have nothing to do with each other: no test of a place looks further."""
@@ -23,6 +24,8 @@ class LoadedPlaces:
 
     boxes: PoseBoxes
     lonely: bytes
+    served: dict[StandPose, tuple[bool, ...]] = field(default_factory=dict)
+    """For some standing poses: True for each place that the arm reaches over the support's rim and past its open doors."""
 
 
 def loaded_places(

@@ -82,12 +82,15 @@ class Placer:
                 self.options.warm_up_fresh(held, target, relation)
                 yield
 
-    def look_into(self, target: str, tables: Iterable[Sequence[str]]) -> None:
-        """Look around the verified poses on a support of a scene in which only this support was opened."""
+    def look_into(self, target: str, tables: Iterable[Sequence[str]], robot: StandPose) -> None:
+        """Look around the verified poses on a support of a scene in which only this support was opened.
+
+        The robot will probably stand at ``robot``.
+        """
         for table in tables:
             if target in self._supports(table):
                 for held in self._movable(table):
-                    self._look_around(held, target)
+                    self._look_around(held, target, robot)
 
     def _movable(self, table: Sequence[str]) -> list[str]:
         return [name for name in table if not self._scene.by_name[name].fixed]
@@ -95,7 +98,7 @@ class Placer:
     def _supports(self, table: Sequence[str]) -> list[str]:
         return [name for name in table if links_with_surfaces(self._scene.asset_of(name))]
 
-    def _look_around(self, held: str, target: str) -> None:
+    def _look_around(self, held: str, target: str, robot: StandPose | None = None) -> None:
         """Look around the verified poses of a pair now, and keep what was found for later states of the scene."""
         engine, fractions = self._engine, self._scene.by_name[held].joints
         for relation in PLACE_RELATIONS:
@@ -105,6 +108,8 @@ class Placer:
                     frames = link_frames(engine, target, relation)
                     found = loaded_places(engine, target, options.places, fractions, frames)
                     options.as_loaded[support] = found
+                    if robot is not None:
+                        self._search(held, target, relation, robot).served(found)
 
     def find(
         self,
@@ -141,17 +146,7 @@ class Placer:
         if not is_upright(self._engine.pose(target)):
             return fails
         reached = self._reached_in_set(held, target, relation)
-        search = PlacementSearch(
-            self._engine,
-            self._relations,
-            self.options,
-            self._moved,
-            held,
-            target,
-            relation,
-            robot,
-            excluded_stands,
-        )
+        search = self._search(held, target, relation, robot, excluded_stands)
         poses = search.poses(rng, reached)
         found = self._first(most, held, poses if reached is not None else self._takeable_first(search, poses))
         if found:
@@ -169,10 +164,7 @@ class Placer:
         before = self._engine.pose(held)
         try:
             for stand in stands:
-                search = PlacementSearch(
-                    self._engine, self._relations, self.options, self._moved, held, target, relation, stand
-                )
-                answer = search.hindrance()
+                answer = self._search(held, target, relation, stand).hindrance()
                 if answer[0] is FailureReason.NO_FREE_POSE:
                     return answer
                 if answer[0] is FailureReason.PLACES_BEHIND_DOOR:
@@ -193,9 +185,7 @@ class Placer:
         options = next(self.options.verified(held, target, relation), None)
         if options is None or held == target or not is_upright(self._engine.pose(target)):
             return ()
-        search = PlacementSearch(
-            self._engine, self._relations, self.options, self._moved, held, target, relation, robot
-        )
+        search = self._search(held, target, relation, robot)
         return self._first(most, held, search.accepted(options, range(len(options))))
 
     def _first(self, most: int, held: str, found: Iterator[T]) -> tuple[T, ...]:
@@ -207,6 +197,26 @@ class Placer:
             if not self._engine.is_parked(held):
                 self._engine.set_pose(held, before)
                 self._engine.park(held)
+
+    def _search(
+        self,
+        held: str,
+        target: str,
+        relation: Relation,
+        robot: StandPose,
+        excluded: tuple[StandPose, ...] = (),
+    ) -> PlacementSearch:
+        return PlacementSearch(
+            self._engine,
+            self._relations,
+            self.options,
+            self._moved,
+            held,
+            target,
+            relation,
+            robot,
+            excluded,
+        )
 
     def _fits(self, held: str, target: str, relation: Relation) -> bool:
         """Return True if a pose exists when nothing else is there."""

@@ -39,6 +39,8 @@ LIVE_TRIES: Final = 64
 """Candidates tried beyond the cached ones."""
 EXAMINED: Final = 12
 """Places of each set that are examined for the object in the way."""
+STANDS_KEPT: Final = 8
+"""Standing poses for which a set of known places remembers the ones in reach."""
 LIVE_SETTLES: Final = 8
 """Most of these candidates that are simulated."""
 HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
@@ -168,7 +170,7 @@ class PlacementSearch:
             is_crowded = self._crowding_of(boxes, ignore)
         rows: list[int] = []
         crowded: list[int] = []
-        for number, corner in self._handy_first(boxes, order, rows):
+        for number, corner in self._handy_first(known, boxes, order, rows):
             found = is_crowded(number, corner)
             if found:
                 crowded.append(number)
@@ -205,15 +207,17 @@ class PlacementSearch:
         return lambda number, corner: bool(crowded[number])
 
     def _handy_first(
-        self, boxes: PoseBoxes, order: Sequence[int], rows: list[int]
+        self, known: LoadedPlaces | None, boxes: PoseBoxes, order: Sequence[int], rows: list[int]
     ) -> Iterator[tuple[int, Corner]]:
         """Numbers and corners of the boxes in reach, handy ones first. ``rows`` receives the numbers as they are tested."""
-        stands = (self.robot, *self.excluded_stands)
-        if self._rises_over_rim or len(stands) > 1 or any(self.engine.joints(self.target)):
-            reached, *excluded = (self._served(boxes, stand) for stand in stands)
-            for other in excluded:
-                reached &= ~other
-            served = reached.tolist()
+        if self.excluded_stands:
+            reached = self._served(boxes, self.robot)
+            for stand in self.excluded_stands:
+                reached &= ~self._served(boxes, stand)
+            served: Sequence[bool] = reached.tolist()
+            order = [number for number in order if served[number]]
+        elif self._rises_over_rim or any(self.engine.joints(self.target)):
+            served = self.served(known) if known is not None else self._served(boxes, self.robot).tolist()
             order = [number for number in order if served[number]]
         corners = boxes.corners()
         reach, easy = Range.of(self.robot, *REACHED), Range.of(self.robot, *HANDY)
@@ -228,6 +232,15 @@ class PlacementSearch:
                     others.append(number)
         for number in others:
             yield number, corners[number]
+
+    def served(self, known: LoadedPlaces) -> Sequence[bool]:
+        """Tell for each known place if the arm reaches it. The robot stands at few places beside a support."""
+        found = known.served.get(self.robot)
+        if found is None:
+            if len(known.served) >= STANDS_KEPT:
+                known.served.clear()
+            found = known.served[self.robot] = tuple(self._served(known.boxes, self.robot).tolist())
+        return found
 
     def _served(self, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
         """Tell for each box, shape (n,), if the arm reaches it over the target's rim and past its open doors."""
