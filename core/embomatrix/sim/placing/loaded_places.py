@@ -1,14 +1,14 @@
 """Candidate places in the scene as loaded: what is near each of them, so that later only moved objects need a look."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.geometry.batch_poses import BoolArray, PoseBoxes, PoseSet
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import Aabb, FloatArray, Pose
 from embomatrix.world.poses import StandPose
 
 NOTHING_NEAR_M: Final = 0.02
@@ -19,13 +19,17 @@ NOTHING_NEAR_M: Final = 0.02
 class LoadedPlaces:
     """World boxes of n candidate poses on a support that is as loaded.
 
-    ``lonely`` has a 1 for each pose with no wall and no object but the support near it in the scene as loaded, else a 0.
+    ``table`` has shape (n, 7): low corner, high corner, and a 1 for each pose with no wall and no object but the support near
+    it in the scene as loaded, else a 0. It is one array, because each object that a slot reads is a copied page.
     """
 
-    boxes: PoseBoxes
-    lonely: bytes
-    served: dict[StandPose, tuple[bool, ...]] = field(default_factory=dict)
-    """For some standing poses: True for each place that the arm reaches over the support's rim and past its open doors."""
+    table: FloatArray
+    served: dict[StandPose, tuple[bool, ...]] | None = None
+    """For some standing poses: True for each place that the arm reaches past the open doors. None for a shut support."""
+
+    @property
+    def boxes(self) -> PoseBoxes:
+        return PoseBoxes(self.table[:, :3], self.table[:, 3:6])
 
 
 def loaded_places(
@@ -45,7 +49,8 @@ def loaded_places(
         lonely = ~boxes.meet(others, NOTHING_NEAR_M)
         if engine.is_at_wall(around):
             lonely &= [not engine.is_at_wall(box.grown(NOTHING_NEAR_M)) for box in boxes.each()]
-    return LoadedPlaces(boxes, lonely.tobytes())
+    table = np.column_stack([boxes.lows_m, boxes.highs_m, lonely])
+    return LoadedPlaces(table, {} if any(engine.joints(target)) else None)
 
 
 class MovedObjects:

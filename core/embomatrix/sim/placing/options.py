@@ -48,7 +48,8 @@ class CandidatePoses:
 
     def link(self, number: int) -> str:
         """Link that carries a pose."""
-        return self.places.links[int(self.places.link_of[number])]
+        links = self.places.links
+        return links[0] if len(links) == 1 else links[int(self.places.link_of[number])]
 
 
 @dataclass(frozen=True, slots=True)

@@ -186,7 +186,7 @@ class PlacementSearch:
 
     def _crowding(self, known: LoadedPlaces, ignore: frozenset[str]) -> Callable[[int, Corner], bool | None]:
         """Return a test of one place for objects around it. It answers None if no wall is near either."""
-        lonely, moved, near = known.lonely, self.moved.boxes(ignore), self.engine.near
+        lonely, moved, near = known.table[:, 6].tolist(), self.moved.boxes(ignore), self.engine.near
 
         def is_crowded(number: int, corner: Corner) -> bool | None:
             a, b, c, d, e, f = corner
@@ -234,12 +234,15 @@ class PlacementSearch:
             yield number, corners[number]
 
     def served(self, known: LoadedPlaces) -> Sequence[bool]:
-        """Tell for each known place if the arm reaches it. The robot stands at few places beside a support."""
-        found = known.served.get(self.robot)
+        """Tell for each known place if the arm reaches it. The robot stands at few places beside an open support."""
+        memory = known.served
+        found = memory.get(self.robot) if memory is not None else None
         if found is None:
-            if len(known.served) >= STANDS_KEPT:
-                known.served.clear()
-            found = known.served[self.robot] = tuple(self._served(known.boxes, self.robot).tolist())
+            found = tuple(self._served(known.boxes, self.robot).tolist())
+            if memory is not None:
+                if len(memory) >= STANDS_KEPT:
+                    memory.clear()
+                memory[self.robot] = found
         return found
 
     def _served(self, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
