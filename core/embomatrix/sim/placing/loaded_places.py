@@ -25,7 +25,7 @@ class LoadedPlaces:
 
     table: FloatArray
     served: dict[StandPose, tuple[bool, ...]] | None = None
-    """For some standing poses: True for each place that the arm reaches past the open doors. None for a shut support."""
+    """Standing poses, each with a True for every place that the arm reaches past the open doors; None for a shut support."""
 
     @property
     def boxes(self) -> PoseBoxes:
