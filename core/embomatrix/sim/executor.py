@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -147,6 +148,8 @@ class Simulator:
         self._calls: list[SkillCall] = []
         self._hash = hashlib.sha256()
         self._touched: set[str] = set()
+        self._as_loaded: dict[str, ObjectDescription] = {}
+        """Descriptions of objects in the scene as loaded."""
 
     @property
     def touched(self) -> frozenset[str]:
@@ -301,11 +304,15 @@ class Simulator:
         """
         world = self.world
         yield from world.relations.supports.warm_up()
+        for name in dict.fromkeys(itertools.chain.from_iterable(self._tables)):
+            self._description(name)
+            yield
         yield from world.placer.warm_up()
         yield from world.navigator.warm_up()
         yield from world.swings.warm_up()
+        yield from world.warm_up(self._tables)
         # Least useful, so last: a slot that is forked early misses it the least.
-        yield from world.placer.options.warm_up(self._tables)
+        yield from world.placer.warm_up_pairs(self._tables)
 
     def close(self) -> None:
         """Close the engine and the actor and end the simulator's use."""
@@ -323,6 +330,15 @@ class Simulator:
         return f"{sentence}; {gained(by_object)}"
 
     def _description(self, name: str) -> ObjectDescription:
+        """Describe an object. Most are as loaded."""
+        if not self.world.is_untouched(name):
+            return self._describe(name)
+        known = self._as_loaded.get(name)
+        if known is None:
+            known = self._as_loaded[name] = self._describe(name)
+        return known
+
+    def _describe(self, name: str) -> ObjectDescription:
         world = self.world
         host = world.hand.hosts.get(name) or world.relations.host_of(name)
         asset = world.asset(name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 from embomatrix.sim.engine import EngineMark, PhysicsEngine
@@ -166,6 +166,8 @@ class LiveWorld:
         self.table: tuple[str, ...] = ()
         self.rooms = tuple(room.name for room in self.scene.rooms)
         self.robot = self.navigator.start
+        self._robot_text: tuple[StandPose | None, str] = (None, "")
+        """Robot's pose in the last ``state_bytes``, and its text: half of the calls do not move the robot."""
         for item in self.scene.objects:
             self.states[item.name] = set(item.states & SYMBOLIC)
             self.substances[item.name] = set(facts_of(item.states, item.substances))
@@ -220,10 +222,37 @@ class LiveWorld:
         self.table = mark.table
         self.navigator.refresh()
 
+    def warm_up(self, tables: Sequence[Sequence[str]]) -> Iterator[None]:
+        """Look for places beside and behind the open doors of each table's objects, one object per step. Changes no answer.
+
+        Only the unchanged scene is used, before the first reset. It is reset after each step.
+        """
+        for name in dict.fromkeys(itertools.chain.from_iterable(tables)):
+            if not self.swings.is_predicted(name) or self.engine.state_bytes():
+                continue
+            before = self.navigator.nearest_stand(name, self.navigator.start)
+            self.swings.open(name)
+            self.navigator.refresh()
+            if before is not None:
+                self.navigator.step_aside(name, before)
+                beside = self.navigator.nearest_stand(name, before)
+                self.placer.look_into(name, tables, beside or before)
+            self.engine.reset()
+            self.navigator.refresh()
+            yield
+
     def let_sources_act(self) -> tuple[Change, ...]:
         """Let heat, cold and water act on the objects at their sources. Return the changes."""
         self._changes_since.read()
         return (*self.thermal.apply(self._changes_since), *self.water.apply(self._changes_since))
+
+    def is_untouched(self, name: str) -> bool:
+        """Return True if the object, its place and its states are certainly those at the start."""
+        return (
+            self.relations.supports.are_untouched((name,))
+            and self.states.is_untouched(name)
+            and self.substances.is_untouched(name)
+        )
 
     @property
     def carried(self) -> tuple[str, ...]:
@@ -294,8 +323,10 @@ class LiveWorld:
 
     def state_bytes(self) -> bytes:
         """Differences of the engine's and the symbolic state from the scene's start, plus the robot and the hand."""
-        robot, carried = self.robot, " ".join(self.hand.carried)
-        lines = [f"{robot.x_m.hex()} {robot.y_m.hex()} {robot.yaw.hex()}\n{carried}"]
+        robot = self.robot
+        if robot is not self._robot_text[0]:
+            self._robot_text = robot, f"{robot.x_m.hex()} {robot.y_m.hex()} {robot.yaw.hex()}\n"
+        lines = [self._robot_text[1] + " ".join(self.hand.carried)]
         for name, states in self.states.changed():
             lines.append(f"{name}:{','.join(sorted(states))}")
         for name, treated in self.treatments.changed():

@@ -85,8 +85,8 @@ class Rule:
 def check(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     """Return a refusal for the first precondition of the call that does not hold, None when all hold."""
     bound = BoundCall(world, call, target_of(world, call), source_of(world, call))
-    for precondition in LIBRARY[call.skill].preconditions:
-        refusal = RULES[precondition].check(bound)
+    for holds in _CHECKS[call.skill]:
+        refusal = holds(bound)
         if refusal is not None:
             return refusal
     return None
@@ -353,3 +353,9 @@ RULES: Final[Mapping[Precondition, Rule]] = {
     ),
 }
 """Rule of each precondition."""
+
+_CHECKS: Final = {
+    skill: tuple(RULES[precondition].check for precondition in found.preconditions)
+    for skill, found in LIBRARY.items()
+}
+"""Checks of each skill's preconditions, in their order."""

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.sim.geometry.batch_poses import Neighbours, PoseBoxes, PoseSet
+from embomatrix.sim.geometry.batch_poses import HANDY, REACHED, Neighbours, PoseBoxes, PoseSet, Range
 from embomatrix.sim.geometry.bounds import bounds_of, square_box
 from embomatrix.sim.placing.search import in_reach
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
@@ -69,7 +69,30 @@ def test_batch_reach_equals_single_reach(boxes, x, y) -> None:
 )
 def test_near_place_at_medium_height_is_handy(away_m, height_m, handy) -> None:
     cube = Aabb((away_m, -0.05, height_m - 0.05), (away_m + 0.1, 0.05, height_m + 0.05))
-    assert pose_boxes_of([cube]).handy_from(StandPose(0.0, 0.0, 0.0)).tolist() == [handy]
+    easy = Range.of(StandPose(0.0, 0.0, 0.0), *HANDY)
+    assert easy.includes((*cube.low_m, *cube.high_m)) == handy
+
+
+@given(st.lists(BOX, min_size=1, max_size=6), COORDINATE, COORDINATE)
+def test_range_tells_of_each_box_what_the_batch_tells(boxes, x, y) -> None:
+    stand = StandPose(x, y, 0.0)
+    reach, batch = Range.of(stand, *REACHED), pose_boxes_of(boxes)
+    assert [reach.includes(corner) for corner in batch.corners()] == batch.reached_from(stand).tolist()
+
+
+def test_range_ends_to_the_bit_where_the_batch_ends() -> None:
+    away_m = REACHED[0]
+    for x in (away_m, math.nextafter(away_m, 9.0), math.nextafter(away_m, 0.0)):
+        box = Aabb((x * 0.6, x * 0.8, 0.5), (x, x, 0.6))
+        stand = StandPose(0.0, 0.0, 0.0)
+        expected = pose_boxes_of([box]).reached_from(stand).tolist()
+        assert [Range.of(stand, *REACHED).includes((*box.low_m, *box.high_m))] == expected
+
+
+@given(st.lists(BOX, min_size=1, max_size=4), st.lists(BOX, max_size=4), st.floats(0.0, 0.1))
+def test_batch_meets_what_single_boxes_overlap(boxes, others, margin_m) -> None:
+    expected = [any(box.grown(margin_m).overlaps(other) for other in others) for box in boxes]
+    assert pose_boxes_of(boxes).meet(others, margin_m).tolist() == expected
 
 
 def test_pose_inside_a_solid_object_is_taken_and_beside_it_is_free() -> None:

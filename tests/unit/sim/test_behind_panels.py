@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.fakes.furniture import cupboard
 
 from embomatrix.sim.geometry.batch_poses import PoseBoxes
-from embomatrix.sim.geometry.behind_panels import behind_panels
+from embomatrix.sim.geometry.behind_panels import barriers, behind_panels
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 
@@ -29,7 +29,7 @@ def is_behind(
     middle = np.array([pose.apply(point)])
     x, y, _ = pose.apply((*stand, 0.0))
     boxes = PoseBoxes(middle - 0.03, middle + 0.03)
-    (answer,) = behind_panels(boxes, FRIDGE, pose, (fraction,), StandPose(x, y, 0.0)).tolist()
+    (answer,) = behind_panels(boxes, barriers(FRIDGE, pose, (fraction,)), StandPose(x, y, 0.0)).tolist()
     return bool(answer)
 
 

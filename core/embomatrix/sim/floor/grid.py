@@ -22,6 +22,8 @@ from embomatrix.world.scene import Scene
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int16]
 Changes = tuple[tuple[FloatArray, int], ...]
+Blocked = tuple[Window, BoolArray]
+"""Window, and its cells in which the robot would touch an obstacle."""
 
 CELL_M: Final = 0.05
 SNAP_CELLS: Final = 6
@@ -102,8 +104,12 @@ class FloorGrid:
 
         Returns the same grid if the free floor is the same. Costs less than ``changed``, which measures distances anew.
         """
-        taken: list[tuple[Window, BoolArray]] = []
-        for around, blocked in self._blocked_by(boxes):
+        return self.narrowed_by(self.blocked_by(boxes))
+
+    def narrowed_by(self, blocks: Sequence[Blocked]) -> FloorGrid:
+        """Evaluate ``narrowed`` for obstacles by their ``blocked_by``."""
+        taken: list[Blocked] = []
+        for around, blocked in blocks:
             if (self.parts.within(around)[blocked] > 0).any():
                 taken.append((around, blocked))
         if not taken:
@@ -116,8 +122,8 @@ class FloorGrid:
             free[overlap(window, around)[0]] &= ~blocked
         return self._with_parts(self.parts.changed(free, window))
 
-    def _blocked_by(self, boxes: FloatArray) -> list[tuple[Window, BoolArray]]:
-        """Window and blocked cells around each distinct cell rectangle under the boxes."""
+    def blocked_by(self, boxes: FloatArray) -> list[Blocked]:
+        """Window and blocked cells around each distinct cell rectangle under the boxes; equal for all grids of a scene."""
         windows = (self._window(box[:2], box[2:4]) for box in boxes.tolist())
         clusters = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
         return [_blocked(slice(*cluster[:2]), slice(*cluster[2:]), self._shape) for cluster in clusters]
@@ -315,7 +321,7 @@ def _clear(covered: NDArray[np.int16]) -> BoolArray:
     return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
 
 
-def _blocked(rows: slice, columns: slice, shape: tuple[int, int]) -> tuple[Window, BoolArray]:
+def _blocked(rows: slice, columns: slice, shape: tuple[int, int]) -> Blocked:
     """Window around a rectangle of cells in which the robot may touch it, and the blocked cells in it."""
     reach = math.ceil(ROBOT.radius_m / CELL_M)
     around_i = slice(max(0, rows.start - reach), min(shape[0], rows.stop + reach))

@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-from embomatrix.sim.caches import RecentCache
+from embomatrix.sim.caches import BoundedCache, RecentCache
 from embomatrix.sim.engine import PhysicsEngine
-from embomatrix.sim.floor.grid import FloorGrid
+from embomatrix.sim.floor.grid import Blocked, FloorGrid
 from embomatrix.sim.floor.obstacles import WALLS, Obstacles
-from embomatrix.sim.floor.open_panels import OpenJoints, OpenPanels
+from embomatrix.sim.floor.open_panels import OpenJoint, OpenJoints, OpenPanels
 from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.geometry import IDENTITY, Pose
@@ -19,6 +19,8 @@ GRIDS_KEPT: Final = 2
 """Floor layouts in memory besides the first: a plan returns to few; each takes 1 MB in a house with a garden."""
 NARROWED_KEPT: Final = 12
 """Grids with open doors and drawers in memory per layout; most of their data is shared."""
+PANELS_KEPT: Final = 512
+"""Objects with open panels whose blocked cells are in memory, some kB each."""
 
 Floor = tuple[tuple[int, Pose | None], ...]
 """Movable objects whose place on the floor differs from the start: number and pose, None if no longer there."""
@@ -56,6 +58,8 @@ class Ground:
         self._moved: dict[int, Pose | None] = {}
         """Unsorted entries of ``floor``."""
         self._open_panels = OpenPanels(engine)
+        self._blocked = BoundedCache(PANELS_KEPT, self._find_blocked)
+        """Cells that the open panels of an object block; it needs no floor."""
         self._round, self._read = -1, 0
         self._current: FloorLayout | None = None
         self._now: FloorGrid | None = None
@@ -124,8 +128,11 @@ class Ground:
     def _narrowed(self, layout: FloorLayout, joints: OpenJoints) -> FloorGrid:
         """Grid of a layout with panels at these joint positions."""
         return layout.narrowed.get(
-            joints, lambda: layout.grid.narrowed(self._open_panels.obstacles(joints).blocking)
+            joints, lambda: layout.grid.narrowed_by([block for one in joints for block in self._blocked[one]])
         )
+
+    def _find_blocked(self, one: OpenJoint) -> list[Blocked]:
+        return self.at_start.grid.blocked_by(self._open_panels.obstacles((one,)).blocking)
 
     def with_shut(self, number: int) -> FloorGrid:
         """Grid if one object's panels were shut."""

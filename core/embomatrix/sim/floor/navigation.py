@@ -61,6 +61,8 @@ class Navigator:
         self._stands = BoundedCache(ANSWERS_KEPT, self._find_stands)
         self._asides = BoundedCache(ANSWERS_KEPT, self._find_aside)
         self._blockers = BoundedCache(ANSWERS_KEPT, self._find_blockers)
+        self._blockers_at_start: dict[str, FloatArray] = {}
+        """Blockers of objects that are as loaded, by name: a look-up costs less than by all that they depend on."""
         self._found_before = stands if stands is not None else {}
 
     def refresh(self) -> None:
@@ -141,22 +143,23 @@ class Navigator:
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
             return
-        grid = self.ground.grid
-        if grid is self.ground.shut:
+        ground, grid = self.ground, self.ground.grid
+        if grid is ground.shut:
             yield from self._stands_on_shut(name, start)
             return
         label = grid.label(start)
-        if self.ground.numbers[name] in dict(self.ground.open_joints):
-            yield from self._stands[self._key(name), self.ground.open_joints, label]
+        number = ground.numbers[name]
+        if any(number == other for other, _ in ground.open_joints):
+            yield from self._stands[self._key(name), ground.open_joints, label]
             return
-        shut = self.stands_past_shut(name, StandPose(*grid.center(start), 0.0))
         found = False
-        for stand in shut:
+        # A cell that is free with panels open is free with all panels shut.
+        for stand in self._stands_on_shut(name, start):
             if grid.label_at(stand.x_m, stand.y_m) == label:
                 found = True
                 yield stand
         if not found:
-            yield from self._stands[self._key(name), self.ground.open_joints, label]
+            yield from self._stands[self._key(name), ground.open_joints, label]
 
     def stands_past_shut(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
         """Evaluate ``stands`` as if all doors and drawers were shut: few panels block any of these places."""
@@ -220,7 +223,7 @@ class Navigator:
     def warm_up(self) -> Iterator[None]:
         """Compute the obstacles of the arm to each object, and the grids with open doors, one per step. Changes no answer."""
         for item in self._scene.objects:
-            self._blockers[self._key(item.name)]
+            self._near_blockers_of(item.name)
             yield
         yield from self.ground.warm_up()
 
@@ -230,24 +233,24 @@ class Navigator:
         fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
         yaw = self._engine.pose(fixed[0] if fixed else name).yaw
         from_front = has_front(self._scene.asset_of(name))
-        return StandingArea(self._relations.body(name), yaw, from_front, self._blockers[self._key(name)])
+        return StandingArea(self._relations.body(name), yaw, from_front, self._near_blockers_of(name))
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Return True if no wall nor anything much taller than the object stands between it and the robot."""
         box = self._relations.body(name)
         here, nearest = _line(origin, box)
-        near = math.dist(here, nearest) <= ROBOT.reach_m
-        blockers = self._blockers[self._key(name)] if near else self._all_blockers_of(name)
-        return not crosses(here, nearest, blockers)
+        if math.dist(here, nearest) > ROBOT.reach_m:
+            return not crosses(here, nearest, self._all_blockers_of(name))
+        return not crosses(here, nearest, self._near_blockers_of(name))
 
     def line_would_be_clear(self, origin: StandPose, box: Aabb, own: Iterable[str]) -> bool:
         """Evaluate ``line_is_clear`` for an object that is not there yet: ``own`` are its name and its would-be hosts."""
         numbers = [self.ground.numbers[name] for name in own]
-        return not crosses(*_line(origin, box), self.ground.obstacles.blockers(box, numbers))
+        return not self.ground.obstacles.block_line(*_line(origin, box), box, numbers)
 
     def is_as_loaded(self, name: str) -> bool:
         """Return True if the object and its hosts are where the scene has them."""
-        return all(
+        return self._relations.are_untouched(name) or all(
             self._engine.pose(item) == self._scene.by_name[item].pose_world_asset
             for item in (name, *self._relations.hosts_of(name))
         )
@@ -256,6 +259,15 @@ class Navigator:
         """Rectangles within reach of an object that block the arm on its way to it, shape (4, n)."""
         _, name, *_ = key
         return _within_reach(self._all_blockers_of(name), self._relations.body(name))
+
+    def _near_blockers_of(self, name: str) -> FloatArray:
+        """Rectangles within reach of an object that block the arm on its way to it, shape (4, n)."""
+        if self.ground.floor or not self._relations.are_untouched(name):
+            return self._blockers[self._key(name)]
+        known = self._blockers_at_start.get(name)
+        if known is None:
+            known = self._blockers_at_start[name] = self._blockers[self._key(name)]
+        return known
 
     def _all_blockers_of(self, name: str) -> FloatArray:
         return self.ground.obstacles.blockers(self._relations.body(name), self._own(name))

@@ -10,8 +10,9 @@ from embomatrix.sim.floor.obstacles import WALLS, Obstacles
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.state import OPEN_FRACTION
 
-OpenJoints = tuple[tuple[int, tuple[float, ...]], ...]
-"""Fixed objects with an open panel: number in the scene and joint positions."""
+OpenJoint = tuple[int, tuple[float, ...]]
+"""Fixed object with an open panel: number in the scene and joint positions."""
+OpenJoints = tuple[OpenJoint, ...]
 
 
 class OpenPanels:
@@ -24,22 +25,30 @@ class OpenPanels:
         self._jointed = frozenset(jointed)
         self._at_start = frozenset(number for number in jointed if any(self._objects[number].joints))
         self._moved = set(self._at_start)
+        self._open: OpenJoints | None = None
+        """Objects that are open, until the next change."""
 
     def forget(self) -> None:
         """Forget all changes after a reset of the engine."""
         self._moved = set(self._at_start)
+        self._open = None
 
     def note(self, number: int) -> None:
         """Record that the object of this number has changed."""
         if number in self._jointed:
             self._moved.add(number)
+            self._open = None
 
     def open_now(self) -> OpenJoints:
         """Objects that are open now, in scene order."""
-        if not self._moved:
-            return ()
-        joints = [(number, self._engine.joints(self._objects[number].name)) for number in sorted(self._moved)]
-        return tuple((number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION)
+        if self._open is None:
+            joints = [
+                (number, self._engine.joints(self._objects[number].name)) for number in sorted(self._moved)
+            ]
+            self._open = tuple(
+                (number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION
+            )
+        return self._open
 
     def each_open(self) -> Iterator[OpenJoints]:
         """Initially open objects plus one more with all its joints wide open, for each object in turn."""

@@ -25,6 +25,11 @@ TAKEN_SHARE: Final = 0.16
 HANDY_M: Final = 0.75
 HANDY_HEIGHTS_M: Final = (0.35, 1.5)
 """Distance from the base's centre and heights of a place that is easy to reach."""
+REACHED: Final = (ROBOT.reach_m, ROBOT.reach_low_m, ROBOT.reach_high_m)
+HANDY: Final = (HANDY_M, *HANDY_HEIGHTS_M)
+"""Largest distance in the plane, lowest and greatest height of the middle: of a box in reach, and of one easy to reach."""
+ROUNDING_M2: Final = 1e-9
+"""Squared distances this near to a limit are compared as whole arrays do it, to the last bit."""
 SAME_LEVEL_M: Final = 0.02
 ROTATIONS_KEPT: Final = 8
 """Rotations of the support for which a set of poses keeps the extents of the object."""
@@ -61,16 +66,29 @@ class PoseBoxes:
         (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()
         return Aabb((a, b, c), (d, e, f))
 
+    def finite(self) -> PoseBoxes:
+        """Boxes of the valid poses."""
+        valid = np.isfinite(self.lows_m[:, 0])
+        return self if valid.all() else PoseBoxes(self.lows_m[valid], self.highs_m[valid])
+
+    def meet(self, others: Sequence[Aabb], margin_m: float) -> BoolArray:
+        """Tell for each box, shape (n,), if it overlaps any other one within a margin."""
+        if not others:
+            return np.zeros(len(self.lows_m), dtype=np.bool_)
+        lows, highs = (np.array([box.low_m for box in others]), np.array([box.high_m for box in others]))
+        near = (self.lows_m[:, None] - margin_m <= highs) & (
+            lows <= self.highs_m[:, None] + margin_m
+        )  # (n, k, 3)
+        return np.asarray((near[..., 0] & near[..., 1] & near[..., 2]).any(axis=1))
+
     def each(self) -> Iterator[Aabb]:
         """Yield them one by one."""
         for (a, b, c), (d, e, f) in zip(self.lows_m.tolist(), self.highs_m.tolist(), strict=True):
             yield Aabb((a, b, c), (d, e, f))
 
-    def crowded(self, others: Sequence[Aabb], margin_m: float) -> Iterator[bool]:
-        """Tell box by box if it overlaps any other one within a margin. Lazy: most callers take the first few."""
-        for box in self.each():
-            grown = box.grown(margin_m)
-            yield any(grown.overlaps(other) for other in others)
+    def corners(self) -> list[list[float]]:
+        """Return the low and then the high corner of each."""
+        return np.concatenate([self.lows_m, self.highs_m], axis=1).tolist()  # type: ignore[no-any-return]  # six floats each
 
     def at(self, rows: Sequence[int]) -> PoseBoxes:
         """Some of the poses, in the order of ``rows``."""
@@ -84,11 +102,7 @@ class PoseBoxes:
 
     def reached_from(self, stand: StandPose) -> BoolArray:
         """Tell for each box, shape (n,), if the arm reaches its nearest point in the plane and the height of its middle."""
-        return self._within(stand, ROBOT.reach_m, ROBOT.reach_low_m, ROBOT.reach_high_m)
-
-    def handy_from(self, stand: StandPose) -> BoolArray:
-        """Return for each box, shape (n,), True if it is easy to reach: neither far out nor near the floor or overhead."""
-        return self._within(stand, HANDY_M, *HANDY_HEIGHTS_M)
+        return self._within(stand, *REACHED)
 
     def _within(self, stand: StandPose, away_m: float, low_m: float, high_m: float) -> BoolArray:
         base = np.array((stand.x_m, stand.y_m))
@@ -115,6 +129,34 @@ class PoseBoxes:
         meets = (shared > least).all(axis=2) & (others.one_part | (others.movable & level))
         most = np.maximum(shared, 0.0).prod(axis=2).argmax(axis=1)
         return np.asarray(meets.any(axis=1)), np.asarray(most)
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Boxes that the arm reaches from one place, tested one by one: equal to the tests of ``PoseBoxes``."""
+
+    x_m: float
+    y_m: float
+    away_m: float
+    least_m: float
+    most_m: float
+    """Twice the lowest and the greatest height."""
+
+    @staticmethod
+    def of(stand: StandPose, away_m: float, low_m: float, high_m: float) -> Range:
+        return Range(stand.x_m, stand.y_m, away_m, 2 * low_m, 2 * high_m)
+
+    def includes(self, corners_m: Sequence[float]) -> bool:
+        """Return True if a box, low corner and then high corner, is in range."""
+        a, b, c, d, e, f = corners_m
+        if not self.least_m <= c + f <= self.most_m:
+            return False
+        x, y, away_m = self.x_m, self.y_m, self.away_m
+        dx, dy = max(a - x, x - d, 0.0), max(b - y, y - e, 0.0)
+        excess_m2 = dx * dx + dy * dy - away_m * away_m
+        if abs(excess_m2) < ROUNDING_M2:
+            return bool(np.hypot(dx, dy) <= away_m)
+        return excess_m2 < 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,12 +99,20 @@ def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArr
     """
     if not found:
         return np.zeros((0, 3))
-    rows = np.arange(tries) % len(found)
-    places = np.array([patch.center_m for patch in found])[rows]  # (n, 3)
-    rooms = np.array([patch.room_m for patch in found])[rows]  # (n, 2)
+    centers = np.array([patch.center_m for patch in found])  # (p, 3)
+    rooms = np.array([patch.room_m for patch in found])  # (p, 2)
+    return spread_over(centers, rooms, shift, tries)
+
+
+def spread_over(centers_m: FloatArray, rooms_m: FloatArray, shift: Vec2, tries: int) -> FloatArray:
+    """Evaluate ``proposed_places`` for patches given by their centres, shape (p, 3), and rooms, shape (p, 2)."""
+    if not len(centers_m):
+        return np.zeros((0, 3))
+    rows = np.arange(tries) % len(centers_m)
+    places = centers_m[rows]  # (n, 3)
     spread = (np.array(shift) + np.arange(1, tries + 1)[:, None] * np.array(GOLDEN)) % 1.0
-    places[:, :2] += (2 * spread - 1) * rooms
-    return places
+    places[:, :2] += (2 * spread - 1) * rooms_m[rows]
+    return np.asarray(places, dtype=np.float64)
 
 
 def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:

@@ -62,6 +62,10 @@ class Swings:
                 self._predict(item.name)
                 yield
 
+    def is_predicted(self, name: str) -> bool:
+        """Return True if the opening of the object is predicted for unchanged surroundings."""
+        return name in self._predicted
+
     def obstacle(self, name: str, goal: float) -> str:
         """Body that stops the panels on their way to a share of their travel, 0 or 1; "" for none. Changes nothing."""
         before = self._engine.joints(name)

@@ -1,18 +1,21 @@
 """Candidate poses of one object on, in or under another: verified poses and fresh ones, independent of the world's state."""
 
-import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Final
+
+import numpy as np
 
 from embomatrix.sim.caches import BoundedCache
 from embomatrix.sim.geometry.batch_poses import PoseSet
+from embomatrix.sim.geometry.behind_panels import Barrier, barriers
 from embomatrix.sim.geometry.bounds import ASSETS_KEPT, bounds_of
-from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, Patch, patches, proposed_places
+from embomatrix.sim.geometry.candidates import patches, spread_over
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.geometry.statics import Base, base_of
 from embomatrix.sim.geometry.surfaces import link_under, links_with_surfaces
-from embomatrix.world.geometry import IDENTITY, Pose, Vec2
+from embomatrix.sim.placing.loaded_places import LoadedPlaces
+from embomatrix.world.geometry import IDENTITY, FloatArray, Pose, Vec2
 from embomatrix.world.placements import pose_rows, rows_of
 from embomatrix.world.poses import PlacementKey, PoseCache
 from embomatrix.world.scene import Scene
@@ -20,6 +23,11 @@ from embomatrix.world.state import Relation
 
 PAIRS_KEPT: Final = 65536
 """Pairs of assets with cached poses: more than a scene has."""
+BARRIERS_KEPT: Final = 256
+"""Open objects with cached barriers, 2 kB each."""
+
+SupportAsLoaded = tuple[str, Relation, tuple[float, ...], tuple[float, ...]]
+"""Support where the scene has it, the relation to it, and the joint positions of the held object and of the support."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +36,8 @@ class CandidatePoses:
 
     places: PoseSet
     exact: Callable[[int], Pose]
+    as_loaded: dict[SupportAsLoaded, LoadedPlaces] = field(default_factory=dict)
+    """Places in the scene as loaded, as far as they were looked at."""
 
     def __len__(self) -> int:
         return len(self.places.link_of)
@@ -38,7 +48,18 @@ class CandidatePoses:
 
     def link(self, number: int) -> str:
         """Link that carries a pose."""
-        return self.places.links[int(self.places.link_of[number])]
+        links = self.places.links
+        return links[0] if len(links) == 1 else links[int(self.places.link_of[number])]
+
+
+@dataclass(frozen=True, slots=True)
+class PatchSet:
+    """Patches for a pair as arrays, centres of shape (p, 3) and rooms of shape (p, 2), and the poses in their middles."""
+
+    centers_m: FloatArray
+    rooms_m: FloatArray
+    yaws: tuple[float, ...]
+    middles: PoseSet
 
 
 class PlacementOptions:
@@ -54,19 +75,8 @@ class PlacementOptions:
         """Footprint class of each asset ("" for none), and the asset's pose in the frame of the class's box."""
         self.bases = BoundedCache(ASSETS_KEPT, self._find_base)
         """Contact polygon of each upright asset; see ``statics``."""
-
-    def warm_up(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
-        """Look up the verified poses for the objects and supports of each table, one pair per step. Changes no answer."""
-        scene = self._scene
-        for table in tables:
-            movable = [name for name in table if not scene.by_name[name].fixed]
-            hosts = [name for name in table if links_with_surfaces(scene.asset_of(name))]
-            for held, target in itertools.product(movable, hosts):
-                joints, pose = scene.by_name[held].joints, scene.by_name[target].pose_world_asset
-                for relation in PLACE_RELATIONS:
-                    for options in self.verified(held, target, relation):
-                        options.places.extents[pose.quat_xyzw, tuple(joints)]
-                yield
+        self.barriers = BoundedCache(BARRIERS_KEPT, self._find_barriers)
+        """Barriers around the cavities of an asset at a pose with these joint positions."""
 
     def verified(self, held: str, target: str, relation: Relation) -> Iterator[CandidatePoses]:
         """Poses verified for this pair of assets, then those verified for the footprint of the held object."""
@@ -78,14 +88,20 @@ class PlacementOptions:
 
     def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> CandidatePoses:
         """Return up to ``tries`` poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
-        found, middles = self._patches[self._key(held, target, relation)]
-        points = proposed_places(found, shift, tries)
+        found = self._patches[self._key(held, target, relation)]
+        yaws, points = found.yaws, spread_over(found.centers_m, found.rooms_m, shift, tries)
 
         def exact(number: int) -> Pose:
             x, y, z = points[number].tolist()
-            return Pose.from_xyz_yaw(x, y, z, found[number % len(found)].yaw)
+            return Pose.from_xyz_yaw(x, y, z, yaws[number % len(yaws)])
 
-        return CandidatePoses(middles.repeated_at(points), exact)
+        return CandidatePoses(found.middles.repeated_at(points), exact)
+
+    def warm_up_fresh(self, held: str, target: str, relation: Relation) -> None:
+        """Prepare fresh poses for a pair in the scene as loaded. Changes no answer."""
+        objects = self._scene.by_name
+        middles = self._patches[self._key(held, target, relation)].middles
+        middles.extents[objects[target].pose_world_asset.quat_xyzw, objects[held].joints]
 
     def _key(self, held: str, target: str, relation: Relation) -> PlacementKey:
         objects = self._scene.by_name
@@ -117,12 +133,20 @@ class PlacementOptions:
 
         return CandidatePoses(places, exact)
 
-    def _find_patches(self, key: PlacementKey) -> tuple[tuple[Patch, ...], PoseSet]:
-        """Patches for a pair, and the poses in their middles."""
+    def _find_patches(self, key: PlacementKey) -> PatchSet:
         bounds = bounds_of(self._scene.assets[key.asset_id])
         found = patches(bounds, self._scene.assets[key.support_asset_id], key.relation)
         middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
-        return found, PoseSet.of(bounds, pose_rows(middles), [patch.link for patch in found])
+        return PatchSet(
+            np.array([patch.center_m for patch in found]).reshape(-1, 3),
+            np.array([patch.room_m for patch in found]).reshape(-1, 2),
+            tuple(patch.yaw for patch in found),
+            PoseSet.of(bounds, pose_rows(middles), [patch.link for patch in found]),
+        )
+
+    def _find_barriers(self, key: tuple[str, Pose, tuple[float, ...]]) -> tuple[Barrier, ...]:
+        asset_id, pose, fractions = key
+        return barriers(self._scene.assets[asset_id], pose, fractions)
 
     def _find_base(self, asset_id: str) -> Base | None:
         return base_of(self._scene.assets[asset_id])

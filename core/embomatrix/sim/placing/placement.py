@@ -1,7 +1,7 @@
 """Placement of a held object: the first verified pose that is still free and in reach."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, TypeVar
 
 import numpy as np
@@ -9,10 +9,11 @@ import numpy as np
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import bounds_of
-from embomatrix.sim.geometry.candidates import candidates
-from embomatrix.sim.geometry.surfaces import is_upright
+from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, YAWS, candidates
+from embomatrix.sim.geometry.surfaces import is_upright, links_with_surfaces
+from embomatrix.sim.placing.loaded_places import MovedObjects, loaded_places
 from embomatrix.sim.placing.options import PlacementOptions
-from embomatrix.sim.placing.search import LIVE_TRIES, PlacementSearch
+from embomatrix.sim.placing.search import LIVE_TRIES, PlacementSearch, link_frames
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.geometry import IDENTITY, Pose
@@ -46,6 +47,7 @@ class Placer:
         self._scene = engine.scene
         self.options = PlacementOptions(engine.scene, cache)
         self._reached = cache.reached
+        self._moved = MovedObjects(engine)
 
     def warm_up(self) -> Iterator[None]:
         """Compute footprints, contact polygons and part boxes, one asset per step. Changes no answer."""
@@ -54,9 +56,60 @@ class Placer:
             if asset_id in movable:
                 self.options.footprints[asset_id]
                 self.options.bases[asset_id]
+                for yaw in YAWS:
+                    bounds_of(asset).box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw))
                 yield
             bounds_of(asset).part_boxes(IDENTITY, (0.0,) * len(asset.joints))
             yield
+
+    def warm_up_pairs(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
+        """Look around the verified poses for the objects and supports of each table, one pair per step. Changes no answer.
+
+        Only the unchanged scene is looked at. Fresh poses for the pairs without verified ones follow.
+        """
+        pairs = [
+            (held, target)
+            for table in tables
+            for target in self._supports(table)
+            for held in self._movable(table)
+        ]
+        for held, target in pairs:
+            if not self._engine.state_bytes():
+                self._look_around(held, target)
+            yield
+        for (held, target), relation in itertools.product(pairs, (Relation.ONTOP, Relation.INSIDE)):
+            if not self.has_verified(held, target, relation):
+                self.options.warm_up_fresh(held, target, relation)
+                yield
+
+    def look_into(self, target: str, tables: Iterable[Sequence[str]], robot: StandPose) -> None:
+        """Look around the verified poses on a support of a scene in which only this support was opened.
+
+        The robot will probably stand at ``robot``.
+        """
+        for table in tables:
+            if target in self._supports(table):
+                for held in self._movable(table):
+                    self._look_around(held, target, robot)
+
+    def _movable(self, table: Sequence[str]) -> list[str]:
+        return [name for name in table if not self._scene.by_name[name].fixed]
+
+    def _supports(self, table: Sequence[str]) -> list[str]:
+        return [name for name in table if links_with_surfaces(self._scene.asset_of(name))]
+
+    def _look_around(self, held: str, target: str, robot: StandPose | None = None) -> None:
+        """Look around the verified poses of a pair now, and keep what was found for later states of the scene."""
+        engine, fractions = self._engine, self._scene.by_name[held].joints
+        for relation in PLACE_RELATIONS:
+            support = (target, relation, fractions, engine.joints(target))
+            for options in self.options.verified(held, target, relation):
+                if support not in options.as_loaded:
+                    frames = link_frames(engine, target, relation)
+                    found = loaded_places(engine, target, options.places, fractions, frames)
+                    options.as_loaded[support] = found
+                    if robot is not None:
+                        self._search(held, target, relation, robot).served(found)
 
     def find(
         self,
@@ -93,9 +146,7 @@ class Placer:
         if not is_upright(self._engine.pose(target)):
             return fails
         reached = self._reached_in_set(held, target, relation)
-        search = PlacementSearch(
-            self._engine, self._relations, self.options, held, target, relation, robot, excluded_stands
-        )
+        search = self._search(held, target, relation, robot, excluded_stands)
         poses = search.poses(rng, reached)
         found = self._first(most, held, poses if reached is not None else self._takeable_first(search, poses))
         if found:
@@ -113,10 +164,7 @@ class Placer:
         before = self._engine.pose(held)
         try:
             for stand in stands:
-                search = PlacementSearch(
-                    self._engine, self._relations, self.options, held, target, relation, stand
-                )
-                answer = search.hindrance()
+                answer = self._search(held, target, relation, stand).hindrance()
                 if answer[0] is FailureReason.NO_FREE_POSE:
                     return answer
                 if answer[0] is FailureReason.PLACES_BEHIND_DOOR:
@@ -137,7 +185,7 @@ class Placer:
         options = next(self.options.verified(held, target, relation), None)
         if options is None or held == target or not is_upright(self._engine.pose(target)):
             return ()
-        search = PlacementSearch(self._engine, self._relations, self.options, held, target, relation, robot)
+        search = self._search(held, target, relation, robot)
         return self._first(most, held, search.accepted(options, range(len(options))))
 
     def _first(self, most: int, held: str, found: Iterator[T]) -> tuple[T, ...]:
@@ -146,8 +194,29 @@ class Placer:
         try:
             return tuple(itertools.islice(found, most))
         finally:
-            self._engine.set_pose(held, before)
-            self._engine.park(held)
+            if not self._engine.is_parked(held):
+                self._engine.set_pose(held, before)
+                self._engine.park(held)
+
+    def _search(
+        self,
+        held: str,
+        target: str,
+        relation: Relation,
+        robot: StandPose,
+        excluded: tuple[StandPose, ...] = (),
+    ) -> PlacementSearch:
+        return PlacementSearch(
+            self._engine,
+            self._relations,
+            self.options,
+            self._moved,
+            held,
+            target,
+            relation,
+            robot,
+            excluded,
+        )
 
     def _fits(self, held: str, target: str, relation: Relation) -> bool:
         """Return True if a pose exists when nothing else is there."""

@@ -2,7 +2,7 @@
 
 import functools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,10 +10,18 @@ import numpy as np
 
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M, PhysicsEngine
 from embomatrix.sim.floor.navigation import has_front
-from embomatrix.sim.geometry.batch_poses import BoolArray, Neighbours, PoseBoxes
+from embomatrix.sim.geometry.batch_poses import (
+    HANDY,
+    REACHED,
+    BoolArray,
+    Neighbours,
+    PoseBoxes,
+    Range,
+)
 from embomatrix.sim.geometry.behind_panels import behind_panels
 from embomatrix.sim.geometry.statics import is_level, rest_pose
 from embomatrix.sim.geometry.surfaces import is_shut, link_frame, links_with_surfaces
+from embomatrix.sim.placing.loaded_places import NOTHING_NEAR_M, LoadedPlaces, MovedObjects
 from embomatrix.sim.placing.options import CandidatePoses, PlacementOptions
 from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
@@ -31,10 +39,16 @@ LIVE_TRIES: Final = 64
 """Candidates tried beyond the cached ones."""
 EXAMINED: Final = 12
 """Places of each set that are examined for the object in the way."""
+STANDS_KEPT: Final = 8
+"""Standing poses for which a set of known places remembers the ones in reach."""
 LIVE_SETTLES: Final = 8
 """Most of these candidates that are simulated."""
 HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
 """Highest rim over which the arm lifts any object it can hold."""
+
+
+Corner = Sequence[float]
+"""Low corner of a box, then its high corner."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +62,7 @@ class PlacementSearch:
     engine: PhysicsEngine
     relations: Relations
     options: PlacementOptions
+    moved: MovedObjects
     held: str
     target: str
     relation: Relation
@@ -72,9 +87,31 @@ class PlacementSearch:
     def accepted(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, Pose]]:
         """Accepted poses of a verified set, each with its number."""
         for number, nearest in self._roomy_first(options, order):
-            found = self._verified(options.pose(number, self._frames), nearest)
+            pose = options.pose(number, self._frames)
+            found = self._lonely(pose) if nearest is None else self._verified(pose, nearest)
             if found is not None:
                 yield number, found
+
+    def _known(self, options: CandidatePoses) -> LoadedPlaces | None:
+        """Places that were looked at in the scene as loaded, if the target has not moved since."""
+        engine, held, target = self.engine, self.held, self.target
+        known = options.as_loaded.get((target, self.relation, engine.joints(held), engine.joints(target)))
+        if known is None or engine.pose(target) != engine.scene.by_name[target].pose_world_asset:
+            return None
+        return known
+
+    def _lonely(self, pose: Pose) -> Pose | None:
+        """Accept a pose that was verified, with nothing but its support near it."""
+        engine, held, target = self.engine, self.held, self.target
+        # The pose was verified with all joints shut: while they are, the object is free of its support.
+        if any((*engine.joints(target), *engine.joints(held))):
+            engine.set_pose(held, pose)
+            if self._is_deep(target):
+                return None
+        if self._holds(pose):
+            return pose
+        engine.set_pose(held, pose)
+        return self._settled()
 
     def _fresh(self, rng: np.random.Generator | None) -> Iterator[Pose]:
         """Poses for pairs that the analysis did not cover, and on surfaces that have filled up."""
@@ -86,7 +123,8 @@ class PlacementSearch:
                 return
             found = self._proved(options, number)
             if found is None:
-                if not self._is_free(options.pose(number, self._frames), nearest) or not self._holds():
+                pose = options.pose(number, self._frames)
+                if not self._is_free(pose, nearest or "") or not self._holds():
                     continue
                 settles += 1
                 found = self._settled()
@@ -115,65 +153,123 @@ class PlacementSearch:
         others = sorted(met.keys() - {"", self.target})
         return FailureReason.NO_FREE_POSE, max(others, key=lambda name: met[name], default="")
 
-    def _roomy_first(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, str]]:
+    def _roomy_first(self, options: CandidatePoses, order: Sequence[int]) -> Iterator[tuple[int, str | None]]:
         """Candidates in reach: first those with nothing but the target around, then the others; handy ones lead each group.
 
-        Each of the others comes with the object it most likely meets. This coarse test uses boxes only; candidates that
-        certainly collide are left out.
+        Each of the others comes with the object it most likely meets, and the first ones with "", or None if no wall is near
+        either. This coarse test uses boxes only; candidates that certainly collide are left out. They are tested one after the
+        other, because most callers take the first.
         """
         if not order:
             return
-        engine, held = self.engine, self.held
-        boxes = options.places.world_boxes(engine.joints(held), self._frames)
-        reached = self._served(boxes, self.robot)
-        for stand in self.excluded_stands:
-            reached &= ~self._served(boxes, stand)
-        flags = reached.tolist()
-        rows = [number for number in order if flags[number]]
-        if not rows:
-            return
-        handy = boxes.handy_from(self.robot).tolist()
-        rows.sort(key=lambda number: not handy[number])
-        boxes = boxes.at(rows)
-        near = engine.near(boxes.around().grown(NEAR_M), frozenset((held, self.target)))
-        others = [engine.aabb(name) for name in near]
+        known, ignore = self._known(options), frozenset((self.held, self.target))
+        if known is not None:
+            boxes, is_crowded = known.boxes, self._crowding(known, ignore)
+        else:
+            boxes = options.places.world_boxes(self.engine.joints(self.held), self._frames)
+            is_crowded = self._crowding_of(boxes, ignore)
+        rows: list[int] = []
         crowded: list[int] = []
-        for place, is_crowded in enumerate(boxes.crowded(others, NEAR_M)):
-            if is_crowded:
-                crowded.append(place)
+        for number, corner in self._handy_first(known, boxes, order, rows):
+            found = is_crowded(number, corner)
+            if found:
+                crowded.append(number)
             else:
-                yield rows[place], ""
+                yield number, None if found is None else ""
         if not crowded:
             return
-        boxes, rows = boxes.at(crowded), [rows[place] for place in crowded]
-        taken, most = (answers.tolist() for answers in boxes.overlaps(_neighbours(engine, near)))
-        for number, full, nearest in zip(rows, taken, most, strict=True):
+        near = self.engine.near(boxes.at(rows).around().grown(NEAR_M), ignore)
+        taken, most = boxes.at(crowded).overlaps(_neighbours(self.engine, near))
+        for number, full, nearest in zip(crowded, taken.tolist(), most.tolist(), strict=True):
             if not full:
                 yield number, near[nearest]
+
+    def _crowding(self, known: LoadedPlaces, ignore: frozenset[str]) -> Callable[[int, Corner], bool | None]:
+        """Return a test of one place for objects around it. It answers None if no wall is near either."""
+        lonely, moved, near = known.table[:, 6].tolist(), self.moved.boxes(ignore), self.engine.near
+
+        def is_crowded(number: int, corner: Corner) -> bool | None:
+            a, b, c, d, e, f = corner
+            box = Aabb((a, b, c), (d, e, f))
+            if lonely[number] and not any(box.overlaps(other, NOTHING_NEAR_M) for other in moved):
+                return None
+            return bool(near(box.grown(NEAR_M), ignore))
+
+        return is_crowded
+
+    def _crowding_of(self, boxes: PoseBoxes, ignore: frozenset[str]) -> Callable[[int, Corner], bool]:
+        """Return a test of one place for objects around it, which looks at all places at once."""
+        valid = boxes.finite()
+        if not len(valid.lows_m):
+            return lambda number, corner: False
+        near = self.engine.near(valid.around().grown(NEAR_M), ignore)
+        crowded = boxes.meet([self.engine.aabb(name) for name in near], NEAR_M).tolist()
+        return lambda number, corner: bool(crowded[number])
+
+    def _handy_first(
+        self, known: LoadedPlaces | None, boxes: PoseBoxes, order: Sequence[int], rows: list[int]
+    ) -> Iterator[tuple[int, Corner]]:
+        """Numbers and corners of the boxes in reach, handy ones first. ``rows`` receives the numbers as they are tested."""
+        if self.excluded_stands:
+            reached = self._served(boxes, self.robot)
+            for stand in self.excluded_stands:
+                reached &= ~self._served(boxes, stand)
+            served: Sequence[bool] = reached.tolist()
+            order = [number for number in order if served[number]]
+        elif self._rises_over_rim or any(self.engine.joints(self.target)):
+            served = self.served(known) if known is not None else self._served(boxes, self.robot).tolist()
+            order = [number for number in order if served[number]]
+        corners = boxes.corners()
+        reach, easy = Range.of(self.robot, *REACHED), Range.of(self.robot, *HANDY)
+        others: list[int] = []
+        for number in order:
+            corner = corners[number]
+            if reach.includes(corner):
+                rows.append(number)
+                if easy.includes(corner):
+                    yield number, corner
+                else:
+                    others.append(number)
+        for number in others:
+            yield number, corners[number]
+
+    def served(self, known: LoadedPlaces) -> Sequence[bool]:
+        """Tell for each known place if the arm reaches it. The robot stands at few places beside an open support."""
+        memory = known.served
+        found = memory.get(self.robot) if memory is not None else None
+        if found is None:
+            found = tuple(self._served(known.boxes, self.robot).tolist())
+            if memory is not None:
+                if len(memory) >= STANDS_KEPT:
+                    memory.clear()
+                memory[self.robot] = found
+        return found
 
     def _served(self, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
         """Tell for each box, shape (n,), if the arm reaches it over the target's rim and past its open doors."""
         engine, asset, fractions = self.engine, self._asset(self.target), self.engine.joints(self.target)
         reached = boxes.reached_from(stand)
-        rim_m = engine.aabb(self.target).high_m[2]
-        if self.relation is Relation.INSIDE and rim_m > HIGH_RIM_M and not has_front(asset):
-            reached &= boxes.raised_over(rim_m).reached_from(stand)
+        if self._rises_over_rim:
+            reached &= boxes.raised_over(engine.aabb(self.target).high_m[2]).reached_from(stand)
         if any(fractions):
-            reached &= ~behind_panels(boxes, asset, engine.pose(self.target), fractions, stand)
+            around = self.options.barriers[asset.asset_id, engine.pose(self.target), fractions]
+            if around:
+                reached &= ~behind_panels(boxes, around, stand)
         return reached
 
     @functools.cached_property
+    def _rises_over_rim(self) -> bool:
+        """Return True if the arm lifts the object over the target's rim, which limits its reach."""
+        rim_m = self.engine.aabb(self.target).high_m[2]
+        return (
+            self.relation is Relation.INSIDE
+            and rim_m > HIGH_RIM_M
+            and not has_front(self._asset(self.target))
+        )
+
+    @functools.cached_property
     def _frames(self) -> dict[str, Pose]:
-        """Frame of each link of the target that can carry objects; shut drawers are left out."""
-        asset = self._asset(self.target)
-        pose, fractions = self.engine.pose(self.target), self.engine.joints(self.target)
-        shut = {
-            item.link
-            for item in asset.interiors
-            if item.link and self.relation is Relation.INSIDE and is_shut(asset, item, fractions)
-        }
-        links = ({""} | links_with_surfaces(asset)) - shut
-        return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
+        return link_frames(self.engine, self.target, self.relation)
 
     def _asset(self, name: str) -> Asset:
         return self.engine.scene.asset_of(name)
@@ -222,14 +318,16 @@ class PlacementSearch:
             return None
         return settled.pose if self._holds() else None
 
-    def _holds(self) -> bool:
-        """Return True if the relation holds at the pose under trial."""
+    def _holds(self, pose: Pose | None = None) -> bool:
+        """Return True if the relation holds at ``pose``, or where the object is tried now."""
         match self.relation:
             case Relation.ONTOP:
-                return self.relations.supports.would_be_on(self.held, self.target)
+                return self.relations.supports.would_be_on(self.held, self.target, pose)
             case Relation.INSIDE:
-                return self.relations.supports.would_be_in(self.held, self.target)
+                return self.relations.supports.would_be_in(self.held, self.target, pose)
             case _:
+                if pose is not None:
+                    self.engine.set_pose(self.held, pose)
                 return self.relations.holds(self.relation, self.held, self.target)
 
     def _is_free(self, pose: Pose, nearest: str) -> bool:
@@ -243,6 +341,20 @@ class PlacementSearch:
 
     def _reaches(self) -> bool:
         return in_reach(self.engine.aabb(self.held), self.robot)
+
+
+def link_frames(engine: PhysicsEngine, target: str, relation: Relation) -> dict[str, Pose]:
+    """Frame of each link of the target that can carry objects; shut drawers are left out."""
+    asset, pose, fractions = engine.scene.asset_of(target), engine.pose(target), engine.joints(target)
+    if not fractions:
+        return {"": pose}
+    shut = {
+        item.link
+        for item in asset.interiors
+        if item.link and relation is Relation.INSIDE and is_shut(asset, item, fractions)
+    }
+    links = ({""} | links_with_surfaces(asset)) - shut
+    return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:

@@ -51,6 +51,10 @@ class TrackedSets(dict[str, set[T]]):
         self._kept = {name: frozenset(members) for name, members in self.items()}
         self._touched.clear()
 
+    def is_untouched(self, name: str) -> bool:
+        """Return True if the set of a name is certainly as in the snapshot."""
+        return name not in self._touched
+
     def changed(self) -> Sequence[tuple[str, set[T]]]:
         """Names and sets that differ from the snapshot, by name."""
         if not self._touched:

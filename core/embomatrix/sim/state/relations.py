@@ -31,6 +31,12 @@ class Relations:
         self._engine = engine
         self._scene = engine.scene
         self.supports = SupportTracker(engine)
+        self._hosts_at_start: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}
+        """Chain of each object with its hosts, and of its hosts alone, in the scene as loaded."""
+        self._resting: dict[str, tuple[str, ...]] = {}
+        self._groups: dict[str, tuple[str, ...]] = {}
+        """Answers that last until the next change."""
+        self._answered_at = (-1, 0)
 
     def holds(self, relation: Relation, a: str, b: str) -> bool:
         """Return True if ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise.
@@ -130,21 +136,53 @@ class Relations:
 
     def hosts_of(self, name: str) -> tuple[str, ...]:
         """Chain of hosts: the object's host, that one's host, and so on."""
+        known = self._hosts_at_start.get(name)
+        if known is not None and self.supports.are_untouched(known[0]):
+            return known[1]
         chain = [name]
         while (host := self.host_of(chain[-1])) is not None and host.name not in chain:
             chain.append(host.name)
+        if known is None and self.supports.are_untouched(chain):
+            self._hosts_at_start[name] = tuple(chain), tuple(chain[1:])
         return tuple(chain[1:])
+
+    def are_untouched(self, name: str) -> bool:
+        """Return True if the object and its hosts have certainly not changed since loading."""
+        known = self._hosts_at_start.get(name)
+        return known is not None and self.supports.are_untouched(known[0])
 
     def resting_on(self, name: str) -> tuple[str, ...]:
         """Objects with this host, in scene order: on its surfaces and in its cavities."""
+        self._forget_if_changed()
+        found = self._resting.get(name)
+        if found is None:
+            found = self._resting[name] = self._find_resting(name)
+        return found
+
+    def group_of(self, name: str) -> tuple[str, ...]:
+        """Object and all that moves with it: the contents of its cavities and what rests on or in those."""
+        self._forget_if_changed()
+        found = self._groups.get(name)
+        if found is None:
+            found = self._groups[name] = self._find_group(name)
+        return found
+
+    def _forget_if_changed(self) -> None:
+        journal = self._engine.journal
+        now = journal.rounds, len(journal.entries)
+        if now != self._answered_at:
+            self._answered_at = now
+            self._resting.clear()
+            self._groups.clear()
+
+    def _find_resting(self, name: str) -> tuple[str, ...]:
         if self._engine.is_parked(name):
             return ()
         around = self._engine.near(self._engine.aabb(name).grown(REST_M), frozenset((name,)))
         hosts = ((other, self.host_of(other)) for other in around)
         return tuple(other for other, host in hosts if host is not None and host.name == name)
 
-    def group_of(self, name: str) -> tuple[str, ...]:
-        """Object and all that moves with it: the contents of its cavities and what rests on or in those."""
+    def _find_group(self, name: str) -> tuple[str, ...]:
         group = {name: None}
         waiting = [other for other in self.resting_on(name) if self._lies_in_host(other)]
         while waiting:

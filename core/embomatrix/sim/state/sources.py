@@ -113,6 +113,8 @@ class Thermal:
         self._treatments = treatments
         self._sources: list[tuple[str, ThermalSource]] = []
         self._acted = False
+        self._areas: dict[str, tuple[Aabb, Aabb]] = {}
+        """Box and area of each source when it was asked for last."""
         for item in self._scene.objects:
             asset = self._scene.assets[item.asset_id]
             found = (heat_source(asset), cold_source(asset))
@@ -122,7 +124,11 @@ class Thermal:
         """Let every working source act. Return the changes in scene order of the sources."""
         changes: list[Change] = []
         first, self._acted = not self._acted, True
+        states = self._states
         for name, source in self._sources:
+            # Most sources are off, and all are checked after every change: so this is checked before anything is called.
+            if source.requires_on and State.TOGGLED_ON not in states.get(name, ()):
+                continue
             # A source without a switch has already acted on everything there, unless something changed since.
             if not self.works(name, source):
                 continue
@@ -134,7 +140,6 @@ class Thermal:
 
     def works(self, name: str, source: ThermalSource) -> bool:
         """Return True if the source is on and closed, as far as it must be."""
-        # The switch is checked first: most sources are off, and all are checked after every change.
         if source.requires_on and State.TOGGLED_ON not in self._states.get(name, ()):
             return False
         if self._engine.is_parked(name):
@@ -163,8 +168,11 @@ class Thermal:
     def _area(self, name: str) -> Aabb:
         """Box of the source, extended upwards by the height of vessels."""
         box = self._engine.aabb(name)
-        x, y, z = box.high_m
-        return Aabb(box.low_m, (x, y, z + VESSEL_M))
+        known = self._areas.get(name)
+        if known is None or known[0] is not box:
+            x, y, z = box.high_m
+            known = self._areas[name] = box, Aabb(box.low_m, (x, y, z + VESSEL_M))
+        return known[1]
 
     def _bears(self, vessel: str, item: str) -> bool:
         return self._relations.inside(item, vessel) or self._relations.ontop(item, vessel)

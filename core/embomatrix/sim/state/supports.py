@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -87,12 +87,20 @@ class SupportTracker:
         """Support of an object."""
         return self._cache_of(name)[name]
 
+    def are_untouched(self, names: Iterable[str]) -> bool:
+        """Return True if none of these objects changed since loading, nor anything that their support depends on."""
+        self._catch_up()
+        return self._stale.isdisjoint(names)
+
     def _cache_of(self, name: str) -> BoundedCache[str, SupportState]:
         """Cache for the object's state, after the journal is read."""
+        self._catch_up()
+        return self._now if name in self._stale else self._at_start
+
+    def _catch_up(self) -> None:
         journal = self._engine.journal
         if len(journal.entries) != self._read or journal.rounds != self._round:
             self._read_journal()
-        return self._now if name in self._stale else self._at_start
 
     def warm_up(self) -> Iterator[None]:
         """Compute the support of every object, one per step. Changes no answer."""
@@ -187,31 +195,39 @@ class SupportTracker:
             return any(item.name == other for item in known.enclosures)
         return self.would_be_in(name, other)
 
-    def would_be_on(self, name: str, other: str) -> bool:
-        """Evaluate ``is_on`` without the cache, for an object that is tried in many places."""
+    def would_be_on(self, name: str, other: str, pose: Pose | None = None) -> bool:
+        """Evaluate ``is_on`` without the cache, for an object that is tried in many places: at ``pose``, or where it is."""
         engine = self._engine
-        box, there = engine.aabb(name), engine.aabb(other)
+        box, there = self._box(name, pose), engine.aabb(other)
         if not box.overlaps(there, REST_M) or not _is_over(box, there):
             return False
-        asset, pose, fractions = self._scene.asset_of(other), engine.pose(other), engine.joints(other)
-        return bool(surface_under(box, asset, pose, fractions, in_cavities=False)) and not self.would_be_in(
-            name, other
+        asset, frame, fractions = self._scene.asset_of(other), engine.pose(other), engine.joints(other)
+        return bool(surface_under(box, asset, frame, fractions, in_cavities=False)) and not self.would_be_in(
+            name, other, pose
         )
 
-    def would_be_in(self, name: str, other: str) -> bool:
-        """Evaluate ``is_in`` without the cache."""
+    def would_be_in(self, name: str, other: str, pose: Pose | None = None) -> bool:
+        """Evaluate ``is_in`` without the cache, for an object at ``pose``, or where it is."""
         engine, asset = self._engine, self._scene.asset_of(other)
-        if not asset.interiors or not engine.aabb(name).overlaps(engine.aabb(other), REST_M):
+        if not asset.interiors or not self._box(name, pose).overlaps(engine.aabb(other), REST_M):
             return False
-        return self._interior(name, asset, engine.pose(other), engine.joints(other)) is not None
+        return self._interior(name, asset, engine.pose(other), engine.joints(other), pose) is not None
 
-    def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
-        """Smallest cavity of an asset at a pose that contains the object."""
+    def _box(self, name: str, pose: Pose | None) -> Aabb:
+        """World box of an object at a pose, or where it is."""
+        if pose is None:
+            return self._engine.aabb(name)
+        return bounds_of(self._scene.asset_of(name)).box(pose, self._engine.joints(name))
+
+    def _interior(
+        self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...], at: Pose | None = None
+    ) -> Interior | None:
+        """Smallest cavity of an asset at a pose that contains the object, which is tried at another pose or where it is."""
         engine, own = self._engine, self._scene.asset_of(name)
         cavities = self._cavities[asset.asset_id]
         if _middle_m(own) > cavities.too_wide_m:
             return None
-        box = engine.aabb(name)
+        box = self._box(name, at)
         # In every orientation the centre of the object's box moves less than this.
         slack = math.dist(box.low_m, box.high_m) / 2
         found: list[Interior] = []
@@ -223,7 +239,7 @@ class SupportTracker:
             if not _may_be_in(inverse.apply(box.center_m), interiors, slack):
                 continue
             placed = square_box(box, inverse) or bounds_of(own).box(
-                inverse @ engine.pose(name), engine.joints(name)
+                inverse @ (at or engine.pose(name)), engine.joints(name)
             )
             interior = interior_around(placed, asset, link)
             if interior is not None:
