@@ -88,20 +88,3 @@ def test_explanation_of_an_equal_rollout_names_the_executed_one(table):
     finish(table, first)
     reasons = [step.reason for step in steps_of("c", state.history(), set())]
     assert "with a, whose plan is equal" in reasons
-
-
-def test_group_stays_on_one_worker_while_no_other_has_a_free_slot(table):
-    for name in ("w1", "w2"):
-        table.worker(name, slots=1)
-    groups = [
-        tuple(Rollout(f"{group}{i}", group, "kitchen", group, (), 0) for i in range(3)) for group in "xy"
-    ]
-    granted = [lease for group in groups for lease in leases(table.apply(_batch(group)))]
-    workers = {lease.rollout.rollout_id: lease.worker_id for lease in granted}
-    # The first group finds both workers idle and is spread. The second one queues behind one of them.
-    assert {workers["x0"], workers["x1"]} == {"w1", "w2"}
-    assert len({worker for rollout_id, worker in workers.items() if rollout_id.startswith("y")}) == 1
-
-
-def _batch(rollouts):
-    return BatchSubmitted(Batch("r1", rollouts[0].group_id, 1, rollouts))

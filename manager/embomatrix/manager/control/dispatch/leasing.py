@@ -38,27 +38,10 @@ def offer_scene(state: DispatchState, scene: str) -> None:
             worker = state.pool.least_busy(scene, _with_credit_for(state, record))
             if worker is not None:
                 state.queues.take(record)
-                grant(state, record, *_with_its_group(state, record, worker))
+                grant(state, record, worker, "least busy worker with the scene warm")
                 break
         else:
             return
-
-
-def _with_its_group(
-    state: DispatchState, record: RolloutRecord, least_busy: WorkerRecord
-) -> tuple[WorkerRecord, str]:
-    """Return the worker for a rollout, and the reason.
-
-    Plans of one group begin alike, and a slot executes their common calls once. So the worker of the group's last lease gets
-    the next one too, but a free slot elsewhere starts at once and comes first.
-    """
-    if record.check or least_busy.free_slots > 0:
-        return least_busy, "least busy worker with the scene warm"
-    group = state.batches.of(record).groups[record.rollout.group_id]
-    kin = state.pool.workers.get(group.worker_id)
-    if kin is None or record.scene not in kin.warm or not _with_credit_for(state, record)(kin):
-        return least_busy, "least busy worker with the scene warm"
-    return kin, "worker of its group, with the scene warm"
 
 
 def fill_workers(state: DispatchState, worker_ids: Iterable[str]) -> None:
@@ -89,8 +72,6 @@ def grant(
 ) -> None:
     """Lease a rollout that is in no queue to a worker that takes it."""
     lease = state.leases.grant(record, worker, state.now_s)
-    if not record.check:
-        state.batches.of(record).groups[record.rollout.group_id].worker_id = worker.worker_id
     state.log(RolloutStepKind.HEDGED if hedge else RolloutStepKind.LEASED, record.key, worker.worker_id, why)
     state.emit(
         GiveLease(

@@ -134,8 +134,6 @@ class GroupRecord:
     """Number of rollouts that ``open`` stands for."""
     failed: bool = False
     """An infrastructure failure took a member."""
-    worker_id: str = ""
-    """Worker of the last lease of a member."""
 
     @property
     def left(self) -> int:
