@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from embomatrix.bench.adversary.inside import ADMIN, manager_inside
-from embomatrix.bench.adversary.kinds import KINDS, Actor
+from embomatrix.bench.adversary.kinds import KINDS, AttackerRole
 from embomatrix.bench.adversary.sequences import ROLLOUTS, play_seed
 from embomatrix.bench.engine.workload import PINNED, load_workload
 from embomatrix.proto.v1 import rollout_service_pb2, worker_service_pb2
@@ -82,7 +82,7 @@ async def test_unexpected_error_inside_the_manager_is_a_traceback(tmp_path):
 
 
 def test_hostile_workers_know_calls_and_messages_within_a_session():
-    methods = {kind.method for kind in KINDS.values() if kind.actor is Actor.WORKER}
+    methods = {kind.method for kind in KINDS.values() if kind.actor is AttackerRole.WORKER}
     assert methods == {
         f"WorkerService/{name}" for name in ("Register", "Session", "Heartbeat", "FetchBundle", "Deregister")
     }

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from embomatrix.bench.adversary.kinds import KINDS, REQUESTS, Actor
+from embomatrix.bench.adversary.kinds import KINDS, REQUESTS, AttackerRole
 from embomatrix.bench.adversary.messages import MessageMaker
 from embomatrix.bench.adversary.siege import SiegeSizes, run_siege
 from embomatrix.bench.adversary.succession import run_succession
@@ -54,7 +54,7 @@ def test_honest_run_completes_when_the_leader_of_two_attacked_managers_is_killed
 
 
 def test_every_call_of_the_protocol_is_attacked_with_and_without_a_token():
-    attacked = {(kind.method, kind.actor is Actor.STRANGER) for kind in KINDS.values()}
+    attacked = {(kind.method, kind.actor is AttackerRole.STRANGER) for kind in KINDS.values()}
     assert attacked >= {(method, without) for method in REQUESTS for without in (True, False)}
     assert len(KINDS) >= 60
 

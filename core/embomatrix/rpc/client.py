@@ -97,7 +97,7 @@ class ClusterClient(AdminClient):
         limits: ClientLimits = DEFAULT_LIMITS,
         merging: bool = True,
     ) -> None:
-        """With ``merging``, equal rollouts of a group are executed once, if the manager of the opened run can do that."""
+        """Connect to the first reachable of the addresses. Equal rollouts of a group are executed once with ``merging``."""
         super().__init__(address, token, ca=ca, call_s=limits.call_s, failover_s=limits.failover_s)
         self._limits = limits
         self._merging = merging

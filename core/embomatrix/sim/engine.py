@@ -36,7 +36,7 @@ class EngineMissingError(EngineError):
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class BodyPlace:
     """Place of one object: its pose, its joints, its box, and whether it is in the world."""
 
     pose: Pose
@@ -45,7 +45,7 @@ class Placed:
     box: Aabb
 
 
-EngineMark = Mapping[str, Placed]
+EngineMark = Mapping[str, BodyPlace]
 """Objects that differ from the scene as loaded, or once did since the last reset, in an engine's state."""
 
 

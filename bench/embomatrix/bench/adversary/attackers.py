@@ -15,7 +15,7 @@ import grpc
 # The modules of kinds enter their kinds on import.
 from embomatrix.bench.adversary import browser_kinds as _browser_kinds
 from embomatrix.bench.adversary import trainer_kinds as _trainer_kinds
-from embomatrix.bench.adversary.kinds import KINDS, SERVICES, Actor, Kind, Knowledge, Payload
+from embomatrix.bench.adversary.kinds import KINDS, SERVICES, AttackerRole, Kind, Knowledge, Payload
 from embomatrix.bench.adversary.messages import MessageMaker
 from embomatrix.bench.adversary.worker_kinds import SESSION, first_state, lie, sound_registration
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
@@ -81,7 +81,7 @@ def _bytes(payload: Payload) -> bytes:
 class Arsenal:
     """Kinds of one actor, drawn by weight. ``every`` visits each kind once before the first draw."""
 
-    def __init__(self, rng: random.Random, actor: Actor, *, calls_only: bool = False) -> None:
+    def __init__(self, rng: random.Random, actor: AttackerRole, *, calls_only: bool = False) -> None:
         found = [kind for kind in KINDS.values() if kind.actor is actor]
         self._kinds = [kind for kind in found if not (calls_only and kind.method == SESSION)]
         self._weights = [kind.weight for kind in self._kinds]
@@ -147,7 +147,7 @@ async def stranger(target: Target, fight: Fight, seed: int) -> None:
     maker = MessageMaker(rng)
     known = Knowledge(rollouts=target.rollouts)
     async with open_channel(target.address) as channel:
-        await _strike_in_parallel(channel, Arsenal(rng, Actor.STRANGER), known, maker, fight)
+        await _strike_in_parallel(channel, Arsenal(rng, AttackerRole.STRANGER), known, maker, fight)
 
 
 async def trainer(target: Target, fight: Fight, seed: int) -> None:
@@ -161,14 +161,14 @@ async def trainer(target: Target, fight: Fight, seed: int) -> None:
         )
         kind = KINDS["any OpenRun"]
         await _call(channel, known.token, kind, [opening.SerializeToString()], fight)
-        await _strike_in_parallel(channel, Arsenal(rng, Actor.TRAINER), known, maker, fight)
+        await _strike_in_parallel(channel, Arsenal(rng, AttackerRole.TRAINER), known, maker, fight)
 
 
 async def browser(target: Target, fight: Fight, seed: int) -> None:
     """Send bytes to the HTTP port, one connection each."""
     rng = random.Random(seed)
     known = Knowledge(token=target.trainer_token, host=target.http)
-    maker, arsenal = MessageMaker(rng), Arsenal(rng, Actor.BROWSER)
+    maker, arsenal = MessageMaker(rng), Arsenal(rng, AttackerRole.BROWSER)
     host, _, port = target.http.rpartition(":")
     while not fight.over:
         kind = arsenal.draw()
@@ -201,7 +201,7 @@ async def hostile_worker(
     """
     rng = random.Random(seed)
     shared = deque(maxlen=64) if foreign is None else foreign
-    arsenal = Arsenal(rng, Actor.WORKER)
+    arsenal = Arsenal(rng, AttackerRole.WORKER)
     lives = 0
     while not fight.over:
         lives += 1

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from embomatrix.bench.adversary.kinds import Actor, Knowledge, hostile
+from embomatrix.bench.adversary.kinds import AttackerRole, Knowledge, hostile
 from embomatrix.bench.adversary.messages import MessageMaker
 
 REWARDS: Final = "/api/v1/rewards"
@@ -18,7 +18,7 @@ RequestOf = Callable[[Knowledge, MessageMaker], bytes]
 
 def _http_kind(name: str, weight: float = 1.0) -> Callable[[RequestOf], RequestOf]:
     def enter(request_of: RequestOf) -> RequestOf:
-        @hostile(name, Actor.BROWSER, weight=weight)
+        @hostile(name, AttackerRole.BROWSER, weight=weight)
         def make(known: Knowledge, maker: MessageMaker) -> Sequence[bytes]:
             return [request_of(known, maker)]
 

@@ -188,7 +188,7 @@ class _Tracebacks(logging.Handler):
 
 
 @dataclass
-class Stream:
+class OpenCall:
     """Open call whose requests are sent one by one."""
 
     task: asyncio.Task[str]
@@ -242,12 +242,12 @@ class ManagerInside:
         await asyncio.wait([stream.task])
         return stream.status, stream.taken()
 
-    def open(self, method: str, token: str) -> Stream:
+    def open(self, method: str, token: str) -> OpenCall:
         """Start a call of any shape."""
         requests: asyncio.Queue[bytes | None] = asyncio.Queue()
         written = _Written()
         task = asyncio.create_task(self._status(SERVICES + method, token, requests, written))
-        return Stream(task, requests, written)
+        return OpenCall(task, requests, written)
 
     async def _status(
         self, method: str, token: str, requests: asyncio.Queue[bytes | None], written: _Written

@@ -25,7 +25,7 @@ SERVICES: Final = "embomatrix.proto.v1."
 LEASES_KEPT: Final = 64
 
 
-class Actor(StrEnum):
+class AttackerRole(StrEnum):
     """Sender of hostile messages, by its token and its transport."""
 
     WORKER = "worker"
@@ -64,7 +64,7 @@ class Kind:
     """Kind of hostile message. ``method`` is SERVICE/CALL, empty for HTTP. ``weight`` is its share among its actor's."""
 
     name: str
-    actor: Actor
+    actor: AttackerRole
     method: str
     make: Make
     weight: float = 1.0
@@ -77,7 +77,7 @@ LARGE_BYTES: Final = 24_000_000
 UNKNOWN_BYTES: Final = 30_000
 
 
-def hostile(name: str, actor: Actor, method: str = "", weight: float = 1.0) -> Callable[[Make], Make]:
+def hostile(name: str, actor: AttackerRole, method: str = "", weight: float = 1.0) -> Callable[[Make], Make]:
     """Decorator that enters a function as the kind ``name``. Raise ValueError if the name is taken."""
 
     def enter(make: Make) -> Make:
@@ -110,16 +110,16 @@ def _enter_every_method() -> None:
     """Enter a random message and a garbled one of every call, by each actor that has a reason to send it."""
     for method, request in REQUESTS.items():
         call = method.split("/")[1]
-        actor = Actor.WORKER if method.startswith("WorkerService") else Actor.TRAINER
+        actor = AttackerRole.WORKER if method.startswith("WorkerService") else AttackerRole.TRAINER
         hostile(f"any {call}", actor, method)(_random(request))
         hostile(f"garbled {call}", actor, method)(_garbled(request))
-        hostile(f"{call} without a token", Actor.STRANGER, method)(_random(request))
+        hostile(f"{call} without a token", AttackerRole.STRANGER, method)(_random(request))
 
 
 _enter_every_method()
 
 
-@hostile("24 MB without a token", Actor.STRANGER, "RolloutService/CancelBatch", SLOW)
+@hostile("24 MB without a token", AttackerRole.STRANGER, "RolloutService/CancelBatch", SLOW)
 def _large_call(_known: Knowledge, maker: MessageMaker) -> Sequence[Payload]:
     return [maker.rng.randbytes(LARGE_BYTES)]
 

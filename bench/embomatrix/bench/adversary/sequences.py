@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.bench.adversary import browser_kinds as _browser_kinds
 from embomatrix.bench.adversary import trainer_kinds as _trainer_kinds
-from embomatrix.bench.adversary.inside import ADMIN, ManagerInside, Stream, manager_inside, run_in_order
-from embomatrix.bench.adversary.kinds import KINDS, Actor, Kind, Knowledge, Payload
+from embomatrix.bench.adversary.inside import ADMIN, ManagerInside, OpenCall, manager_inside, run_in_order
+from embomatrix.bench.adversary.kinds import KINDS, AttackerRole, Kind, Knowledge, Payload
 from embomatrix.bench.adversary.messages import MessageMaker
 from embomatrix.bench.adversary.worker_kinds import SESSION, first_state, sound_registration
 from embomatrix.bench.cluster.null_worker import NullWorker, prepared_result
@@ -94,7 +94,7 @@ class _Foe:
         self.known = known
         self.maker = maker
         self.rng = rng
-        self.streams: list[Stream] = []
+        self.streams: list[OpenCall] = []
 
     def listen(self) -> None:
         """Learn the leases in the answers, and forget most streams that the manager ended."""
@@ -130,10 +130,10 @@ class _Stage:
         self.trainer_maker = MessageMaker(rng, ["hostile", self.rollouts[0].bundle_digest])
         self.ended: Counter[str] = Counter()
         """Number of times that the manager ended a session after a message, by its kind."""
-        of_worker = [kind for kind in KINDS.values() if kind.actor is Actor.WORKER]
+        of_worker = [kind for kind in KINDS.values() if kind.actor is AttackerRole.WORKER]
         self.session_kinds = [kind for kind in of_worker if kind.method == SESSION]
         self.call_kinds = [kind for kind in of_worker if kind.method != SESSION]
-        self.trainer_kinds = [kind for kind in KINDS.values() if kind.actor is Actor.TRAINER]
+        self.trainer_kinds = [kind for kind in KINDS.values() if kind.actor is AttackerRole.TRAINER]
 
     async def join(self) -> str:
         return (await self.manager.gate.issue(AccessRole.JOIN, valid_s=600.0, label=""))[0]
@@ -202,7 +202,7 @@ class _Stage:
         else:
             await self._send(foe, stream, self._session_kind(), "opens a session with")
 
-    async def _send(self, foe: _Foe, stream: Stream, kind: Kind, verb: str) -> None:
+    async def _send(self, foe: _Foe, stream: OpenCall, kind: Kind, verb: str) -> None:
         payloads = _payloads(kind, foe.known, foe.maker)
         if sum(map(len, payloads)) > LARGE:
             return

@@ -4,7 +4,14 @@ import zlib
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from embomatrix.bench.adversary.kinds import LARGE_BYTES, SLOW, Actor, Knowledge, hostile, unknown_field
+from embomatrix.bench.adversary.kinds import (
+    LARGE_BYTES,
+    SLOW,
+    AttackerRole,
+    Knowledge,
+    hostile,
+    unknown_field,
+)
 from embomatrix.bench.adversary.messages import NUMBERS, MessageMaker
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import scene_service_pb2, types_pb2
@@ -22,7 +29,7 @@ Damage = Callable[[pb.ExecuteRequest, MessageMaker], None]
 
 def _open_kind(name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     def enter(damage: Callable[[pb.OpenRunRequest, MessageMaker], None]) -> Callable[..., None]:
-        @hostile(name, Actor.TRAINER, OPEN_RUN, 0.3)
+        @hostile(name, AttackerRole.TRAINER, OPEN_RUN, 0.3)
         def make(known: Knowledge, maker: MessageMaker) -> Sequence[pb.OpenRunRequest]:
             request = pb.OpenRunRequest(
                 name="hostile", run_id=known.run_id, protocol_version=PROTOCOL_VERSION
@@ -39,7 +46,7 @@ def _execute_kind(name: str) -> Callable[[Damage], Damage]:
     """Decorator: the function damages a sound batch of two rollouts in the attacker's own run."""
 
     def enter(damage: Damage) -> Damage:
-        @hostile(name, Actor.TRAINER, EXECUTE)
+        @hostile(name, AttackerRole.TRAINER, EXECUTE)
         def make(known: Knowledge, maker: MessageMaker) -> Sequence[pb.ExecuteRequest]:
             known.batches += 1
             request = pb.ExecuteRequest(run_id=known.run_id, batch_id=f"{known.run_id}-{known.batches}")
@@ -168,20 +175,22 @@ def _same_batch(request: pb.ExecuteRequest, maker: MessageMaker) -> None:
     request.step = maker.count()
 
 
-@hostile("cursor beyond the end", Actor.TRAINER, "RolloutService/WaitExecution")
+@hostile("cursor beyond the end", AttackerRole.TRAINER, "RolloutService/WaitExecution")
 def _cursor(known: Knowledge, maker: MessageMaker) -> Sequence[pb.WaitExecutionRequest]:
     batch = f"{known.run_id}-{maker.rng.randint(0, known.batches + 1)}"
     return [pb.WaitExecutionRequest(run_id=known.run_id, batch_id=batch, after_cursor=maker.count())]
 
 
-@hostile("look-ahead of any entries", Actor.TRAINER, "RolloutService/AnnounceLookahead")
+@hostile("look-ahead of any entries", AttackerRole.TRAINER, "RolloutService/AnnounceLookahead")
 def _lookahead(known: Knowledge, maker: MessageMaker) -> Sequence[pb.AnnounceLookaheadRequest]:
     request = maker.any(pb.AnnounceLookaheadRequest)
     request.run_id = known.run_id
     return [request]
 
 
-@hostile("look-ahead of 4,000 scenes for GPUs", Actor.TRAINER, "RolloutService/AnnounceLookahead", SLOW)
+@hostile(
+    "look-ahead of 4,000 scenes for GPUs", AttackerRole.TRAINER, "RolloutService/AnnounceLookahead", SLOW
+)
 def _many_scenes(known: Knowledge, maker: MessageMaker) -> Sequence[pb.AnnounceLookaheadRequest]:
     scenes = (f"sha256:{maker.rng.getrandbits(256):064x}" for _ in range(4_000))
     entries = [pb.LookaheadEntry(step=1, bundle_digest=scene, count=1, render=True) for scene in scenes]
@@ -190,13 +199,13 @@ def _many_scenes(known: Knowledge, maker: MessageMaker) -> Sequence[pb.AnnounceL
     ]
 
 
-@hostile("batch of 24 MB", Actor.TRAINER, EXECUTE, SLOW)
+@hostile("batch of 24 MB", AttackerRole.TRAINER, EXECUTE, SLOW)
 def _large_batch(known: Knowledge, maker: MessageMaker) -> Sequence[bytes]:
     del known
     return [maker.rng.randbytes(LARGE_BYTES)]
 
 
-@hostile("training figures of NaN", Actor.TRAINER, "RolloutService/ReportTraining")
+@hostile("training figures of NaN", AttackerRole.TRAINER, "RolloutService/ReportTraining")
 def _report(known: Knowledge, maker: MessageMaker) -> Sequence[pb.ReportTrainingRequest]:
     request = maker.any(pb.ReportTrainingRequest)
     request.run_id, request.phase = known.run_id, "grpo"
@@ -216,25 +225,25 @@ def _chunks(digest: str, data: bytes) -> list[scene_service_pb2.PutBundleRequest
 _BOMB: Final = zlib.compress(bytes(BOMB_BYTES), 9)
 
 
-@hostile("decompression bomb", Actor.TRAINER, PUT_BUNDLE, 0.2)
+@hostile("decompression bomb", AttackerRole.TRAINER, PUT_BUNDLE, 0.2)
 def _bomb(known: Knowledge, maker: MessageMaker) -> Sequence[scene_service_pb2.PutBundleRequest]:
     del known, maker
     return _chunks(bundle_digest(_BOMB), _BOMB)
 
 
-@hostile("bundle under a false digest", Actor.TRAINER, PUT_BUNDLE)
+@hostile("bundle under a false digest", AttackerRole.TRAINER, PUT_BUNDLE)
 def _false_digest(known: Knowledge, maker: MessageMaker) -> Sequence[scene_service_pb2.PutBundleRequest]:
     digest = maker.rng.choice(known.rollouts).bundle_digest
     return _chunks(maker.rng.choice((digest, maker.text(), "sha256:" + "e" * 64)), maker.rng.randbytes(999))
 
 
-@hostile("bundle of 20 MB", Actor.TRAINER, PUT_BUNDLE, SLOW)
+@hostile("bundle of 20 MB", AttackerRole.TRAINER, PUT_BUNDLE, SLOW)
 def _large_bundle(known: Knowledge, maker: MessageMaker) -> Sequence[scene_service_pb2.PutBundleRequest]:
     del known
     return _chunks("sha256:" + "d" * 64, maker.rng.randbytes(20_000_000))
 
 
-@hostile("bundle outside the folder", Actor.TRAINER, "SceneService/GetBundle")
+@hostile("bundle outside the folder", AttackerRole.TRAINER, "SceneService/GetBundle")
 def _traversal(known: Knowledge, maker: MessageMaker) -> Sequence[scene_service_pb2.GetBundleRequest]:
     del known
     path = maker.rng.choice(("../state.sqlite", "../../access/ca.key", "/etc/passwd", "sha256:../x"))

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from embomatrix.bench.adversary.kinds import SLOW, Actor, Knowledge, hostile, unknown_field
+from embomatrix.bench.adversary.kinds import SLOW, AttackerRole, Knowledge, hostile, unknown_field
 from embomatrix.bench.adversary.messages import MessageMaker
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.proto.v1 import worker_service_pb2 as pb
@@ -81,7 +81,7 @@ def _result_kind(name: str) -> Callable[[ResultOf], ResultOf]:
     """Decorator: the function damages a well-formed result of a lease that the worker holds."""
 
     def enter(damage: ResultOf) -> ResultOf:
-        @hostile(name, Actor.WORKER, SESSION)
+        @hostile(name, AttackerRole.WORKER, SESSION)
         def make(known: Knowledge, maker: MessageMaker) -> Sequence[pb.SessionRequest]:
             result = _random_lie(known, maker)
             damage(result, maker)
@@ -94,7 +94,7 @@ def _result_kind(name: str) -> Callable[[ResultOf], ResultOf]:
 
 def _state_kind(name: str, weight: float = 1.0) -> Callable[[StateOf], StateOf]:
     def enter(state_of: StateOf) -> StateOf:
-        @hostile(name, Actor.WORKER, SESSION, weight)
+        @hostile(name, AttackerRole.WORKER, SESSION, weight)
         def make(known: Knowledge, maker: MessageMaker) -> Sequence[pb.SessionRequest]:
             return [_request(known, state=state_of(known, maker))]
 
@@ -189,7 +189,7 @@ def _any_result(result: pb.LeaseResult, maker: MessageMaker) -> None:
     result.completed.CopyFrom(maker.any(types_pb2.Completed))
 
 
-@hostile("result of another worker's lease", Actor.WORKER, SESSION)
+@hostile("result of another worker's lease", AttackerRole.WORKER, SESSION)
 def _foreign_result(known: Knowledge, maker: MessageMaker) -> Sequence[pb.SessionRequest]:
     result = _random_lie(known, maker)
     if known.foreign:
@@ -197,13 +197,13 @@ def _foreign_result(known: Knowledge, maker: MessageMaker) -> Sequence[pb.Sessio
     return [_request(known, results=[result])]
 
 
-@hostile("replayed result", Actor.WORKER, SESSION)
+@hostile("replayed result", AttackerRole.WORKER, SESSION)
 def _replayed(known: Knowledge, maker: MessageMaker) -> Sequence[pb.SessionRequest]:
     result = _random_lie(known, maker)
     return [_request(known, results=[result, result]), _request(known, results=[result])]
 
 
-@hostile("result in a wrong session", Actor.WORKER, SESSION)
+@hostile("result in a wrong session", AttackerRole.WORKER, SESSION)
 def _wrong_session(known: Knowledge, maker: MessageMaker) -> Sequence[pb.SessionRequest]:
     request = _request(known, results=[_random_lie(known, maker)])
     request.session_epoch = maker.count()
@@ -338,14 +338,14 @@ def _beat(known: Knowledge) -> pb.HeartbeatRequest:
     return pb.HeartbeatRequest(session_id=known.session_id, session_epoch=known.epoch, running=running)
 
 
-@hostile("load of NaN", Actor.WORKER, HEARTBEAT)
+@hostile("load of NaN", AttackerRole.WORKER, HEARTBEAT)
 def _load(known: Knowledge, maker: MessageMaker) -> Sequence[pb.HeartbeatRequest]:
     beat = _beat(known)
     beat.load, beat.memory_used_mb = maker.number(), maker.count()
     return [beat]
 
 
-@hostile("renewal of another worker's leases", Actor.WORKER, HEARTBEAT)
+@hostile("renewal of another worker's leases", AttackerRole.WORKER, HEARTBEAT)
 def _renew_foreign(known: Knowledge, maker: MessageMaker) -> Sequence[pb.HeartbeatRequest]:
     del maker
     beat = _beat(known)
@@ -353,7 +353,7 @@ def _renew_foreign(known: Knowledge, maker: MessageMaker) -> Sequence[pb.Heartbe
     return [beat]
 
 
-@hostile("progress beyond the plan", Actor.WORKER, HEARTBEAT)
+@hostile("progress beyond the plan", AttackerRole.WORKER, HEARTBEAT)
 def _progress(known: Knowledge, maker: MessageMaker) -> Sequence[pb.HeartbeatRequest]:
     beat = _beat(known)
     for ref in (*beat.running, *known.foreign):
@@ -361,7 +361,7 @@ def _progress(known: Knowledge, maker: MessageMaker) -> Sequence[pb.HeartbeatReq
     return [beat]
 
 
-@hostile("heartbeat in a guessed session", Actor.WORKER, HEARTBEAT)
+@hostile("heartbeat in a guessed session", AttackerRole.WORKER, HEARTBEAT)
 def _guessed(known: Knowledge, maker: MessageMaker) -> Sequence[pb.HeartbeatRequest]:
     beat = _beat(known)
     beat.session_id = maker.rng.randbytes(8).hex()
@@ -372,7 +372,7 @@ def _register_kind(name: str, weight: float = 1.0) -> Callable[[Callable[..., No
     """Decorator: the function damages a sound registration under the worker's own name."""
 
     def enter(damage: Callable[[pb.RegisterRequest, MessageMaker], None]) -> Callable[..., None]:
-        @hostile(name, Actor.WORKER, REGISTER, weight)
+        @hostile(name, AttackerRole.WORKER, REGISTER, weight)
         @functools.wraps(damage)
         def make(known: Knowledge, maker: MessageMaker) -> Sequence[pb.RegisterRequest]:
             request = sound_registration(known)
@@ -422,6 +422,6 @@ def _version(request: pb.RegisterRequest, maker: MessageMaker) -> None:
     request.protocol_version, request.protocol_low = maker.count(2**32 - 1), maker.count(2**32 - 1)
 
 
-@hostile("bundle that was not assigned", Actor.WORKER, "WorkerService/FetchBundle")
+@hostile("bundle that was not assigned", AttackerRole.WORKER, "WorkerService/FetchBundle")
 def _bundle(known: Knowledge, maker: MessageMaker) -> Sequence[pb.FetchBundleRequest]:
     return [pb.FetchBundleRequest(session_id=known.session_id, bundle_digest=maker.text())]

@@ -21,10 +21,10 @@ from embomatrix.sim.engine import (
     SETTLE_STEPS,
     TOLERANCE_M,
     WALL,
+    BodyPlace,
     EngineError,
     EngineMark,
     Journal,
-    Placed,
     Settled,
 )
 from embomatrix.sim.geometry.bounds import AssetBounds, bounds_of, forget
@@ -113,20 +113,20 @@ class BulletEngine:
             self._note(number)
             self._take_on(number, target)
 
-    def _take_on(self, number: int, place: Placed) -> None:
+    def _take_on(self, number: int, place: BodyPlace) -> None:
         self._poses[number], self._fractions[number] = place.pose, place.fractions
         self._present[number] = place.present
         self._bodies.leave_behind(number)
         self._bound(number, place.box)
 
-    def _placed(self, number: int) -> Placed:
-        return Placed(
+    def _placed(self, number: int) -> BodyPlace:
+        return BodyPlace(
             self._poses[number], self._fractions[number], self._present[number], self._boxes[number]
         )
 
-    def _placed_at_start(self, number: int) -> Placed:
+    def _placed_at_start(self, number: int) -> BodyPlace:
         item = self._scene.objects[number]
-        return Placed(
+        return BodyPlace(
             item.pose_world_asset, tuple(item.joints), not item.absent, self._boxes_at_start[number]
         )
 

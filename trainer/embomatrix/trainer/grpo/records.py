@@ -98,7 +98,7 @@ def record_of(
 
 
 def _shared(outcome: Completed) -> list[bool]:
-    """Whether each step was shared."""
+    """Truth for each step of whether it was shared."""
     return [number < outcome.shared_steps for number in range(len(outcome.steps))]
 
 
