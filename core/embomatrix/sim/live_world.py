@@ -225,10 +225,10 @@ class LiveWorld:
     def warm_up(self, tables: Sequence[Sequence[str]]) -> Iterator[None]:
         """Look for places beside and behind the open doors of each table's objects, one object per step. Changes no answer.
 
-        Only the unchanged scene is used, before the first reset. It is reset after each step.
+        A step opens the object and resets the engine. Nothing happens while a rollout has changed the scene.
         """
         for name in dict.fromkeys(itertools.chain.from_iterable(tables)):
-            if not self.swings.is_predicted(name) or self.engine.state_bytes():
+            if not self.swings.is_predicted(name) or self.engine.state_bytes() or self.states.changed():
                 continue
             before = self.navigator.nearest_stand(name, self.navigator.start)
             self.swings.open(name)

@@ -12,7 +12,7 @@ from embomatrix.world.geometry import Aabb, FloatArray, Pose
 from embomatrix.world.poses import StandPose
 
 NOTHING_NEAR_M: Final = 0.02
-"""Boxes this far apart have nothing to do with each other: no test of a place looks further."""
+"""Objects whose boxes are further apart do not affect a placement: its tests look 1.5 cm far."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class LoadedPlaces:
 
     table: FloatArray
     served: dict[StandPose, tuple[bool, ...]] | None = None
-    """Standing poses, each with a True for every place that the arm reaches past the open doors; None for a shut support."""
+    """Places that the arm reaches past the open doors, as flags by standing pose; None for a shut support."""
 
     @property
     def boxes(self) -> PoseBoxes:
@@ -39,7 +39,7 @@ def loaded_places(
     fractions: tuple[float, ...],
     frames: Mapping[str, Pose],
 ) -> LoadedPlaces:
-    """Look around each pose of an object with these joint positions. ``engine`` holds the scene as loaded."""
+    """Look around each pose of an object with these joint positions. Only the target may differ from the scene as loaded."""
     boxes = places.world_boxes(fractions, frames)
     lonely: BoolArray = np.ones(len(boxes.lows_m), dtype=np.bool_)
     valid = boxes.finite()
