@@ -224,21 +224,30 @@ def _lead(
 
 
 def peer_rates(peer: PeerSystem, traffic: RecordedTraffic, sizes: TrafficSizes) -> dict[str, float]:
-    """Return the peer's rollouts per second in each phase. Equal plans of a group are sent once, as a user would do."""
+    """Return the peer's rollouts per second in each phase, of rounds like ours.
+
+    Equal plans of a group are sent once, as a user would do.
+    """
+    rates = {}
+    for suffix, groups in (("", traffic.early), ("_late", traffic.late)):
+        count = sum(len(group.members) for group in groups)
+        walls_s = [_peer_round_s(peer, traffic, groups, sizes) for _ in range(sizes.rounds)]
+        rates[suffix] = count / float(np.median(walls_s))
+    return rates
+
+
+def _peer_round_s(
+    peer: PeerSystem, traffic: RecordedTraffic, groups: Sequence[SubmittedGroup], sizes: TrafficSizes
+) -> float:
+    """Wall time of one round in new processes."""
     with tempfile.TemporaryDirectory(prefix="embo-", ignore_cleanup_errors=True) as name:
         write_bundles(Path(name), traffic.bundles)
         setup = ContenderSetup(Path(name), sizes.slots, tuple(traffic.bundles))
         with LIBRARIES[peer][0](setup) as contender:
             await_processes(contender, sizes.slots, sizes.start_s)
-            rates = {}
-            for suffix, groups in (("", traffic.early), ("_late", traffic.late)):
-                chunks: list[RolloutChunk] = [tuple(merged(group.rollouts())) for group in groups]
-                walls_s = []
-                for _ in range(sizes.rounds):
-                    outcome = execute(contender, chunks, sizes.limit_s)
-                    if outcome.lost or outcome.hung:
-                        raise BenchError(f"{peer.value} lost {outcome.lost + outcome.hung} rollouts")
-                    walls_s.append(outcome.wall_s)
-                count = sum(len(group.members) for group in groups)
-                rates[suffix] = count / float(np.median(walls_s))
-            return rates
+            chunks: list[RolloutChunk] = [tuple(merged(group.rollouts())) for group in groups]
+            execute(contender, [tuple(elsewhere(chunk)) for chunk in chunks], sizes.limit_s)
+            outcome = execute(contender, chunks, sizes.limit_s)
+            if outcome.lost or outcome.hung:
+                raise BenchError(f"{peer.value} lost {outcome.lost + outcome.hung} rollouts")
+            return outcome.wall_s
