@@ -35,7 +35,7 @@ GOALS: Final = {
     "cold_load_ms": 25.0,
     "slot_respawn_ms": 10.0,
     "reset_ms": 0.1,
-    "rollout_p50_ms": 1.5,
+    "rollout_p50_ms": 1.0,
     "rollout_p99_ms": 10.0,
     "private_mb_per_slot": 10.0,
 }
