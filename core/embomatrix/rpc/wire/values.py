@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Final, Self
 
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import PAPER, RewardSettings
@@ -150,7 +150,9 @@ class Completed(_ReadWhenAsked):
         worker_id = self.worker_id if worker_id is None else worker_id
         warm = self.warm if warm is None else warm
         if self.read is not None:
-            return Completed.unread(self.wire, self.read, timings=timings, warm=warm, worker_id=worker_id)
+            return Completed.unread(
+                self.wire, self.read, timings=timings, warm=warm, worker_id=worker_id, **self._checked()
+            )
         copy = Completed(
             self.reward,
             self.steps,
@@ -164,6 +166,16 @@ class Completed(_ReadWhenAsked):
         )
         object.__setattr__(copy, "wire", self.wire)
         return copy
+
+    def _checked(self) -> dict[str, object]:
+        """Return the values that a manager parses to check a result; none if they are not parsed."""
+        try:
+            return {name: object.__getattribute__(self, name) for name in _CHECKED}
+        except AttributeError:
+            return {}
+
+
+_CHECKED: Final = ("reward", "steps", "shared_steps", "observation")
 
 
 class InfraCode(StrEnum):
