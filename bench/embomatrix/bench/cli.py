@@ -152,7 +152,7 @@ def traffic(
 ) -> None:
     """Replay what a training run submitted, with and without shared calls, and through other libraries; play episodes."""
     from embomatrix.bench.traffic.marks import bench_marks
-    from embomatrix.bench.traffic.recording import recorded_traffic, shipped_traffic
+    from embomatrix.bench.traffic.recording import recorded_traffic, sampled_traffic
     from embomatrix.bench.traffic.replay import TrafficSizes, bench_traffic
     from embomatrix.bench.traffic.turns import TurnSizes, bench_turns
 
@@ -164,7 +164,7 @@ def traffic(
     if (record is None) != (dataset is None):
         raise typer.BadParameter("--record and --dataset belong together: expected both or none")
     with refusals():
-        found = shipped_traffic() if record is None or dataset is None else recorded_traffic(record, dataset)
+        found = sampled_traffic() if record is None or dataset is None else recorded_traffic(record, dataset)
         pinned, sizes = load_workload(PINNED), TrafficSizes(rounds=rounds)
         hand_in(_measured("traffic", measure), json_file)
 

@@ -41,11 +41,11 @@ class RecordedTraffic:
     bundles: Mapping[str, bytes]
 
 
-def shipped_traffic() -> RecordedTraffic:
-    """Return the sample that the package ships."""
-    head, *lines = lzma.decompress((PINNED / GROUPS_FILE).read_bytes()).splitlines()
+def sampled_traffic(folder: Path = PINNED) -> RecordedTraffic:
+    """Return the sample in a folder; by default the one that the package ships."""
+    head, *lines = lzma.decompress((folder / GROUPS_FILE).read_bytes()).splitlines()
     scenes: list[tuple[str, int]] = json.loads(head)
-    content = lzma.decompress((PINNED / SCENES_FILE).read_bytes())
+    content = lzma.decompress((folder / SCENES_FILE).read_bytes())
     ends = list(accumulate(size for _, size in scenes))
     # Levels of compression may differ between systems, so the digests are computed again.
     packed = {
@@ -88,7 +88,8 @@ def save_sample(record: Path, dataset: Path, out: Path, scenes: int, seed: int) 
         {digest: whole.bundles[digest] for digest in order},
     )
     lines = [json.dumps([(digest, len(contents[digest])) for digest in order]).encode()]
-    lines += map(msgspec.json.encode, (*sample.early, *sample.late))
+    # A group of a short run may be early and late.
+    lines += dict.fromkeys(map(msgspec.json.encode, (*sample.early, *sample.late)))
     out.mkdir(parents=True, exist_ok=True)
     (out / GROUPS_FILE).write_bytes(lzma.compress(b"\n".join(lines), preset=9))
     (out / SCENES_FILE).write_bytes(lzma.compress(b"".join(contents[digest] for digest in order), preset=9))
