@@ -68,9 +68,12 @@ def test_record_of_another_dataset_is_refused(tmp_path, record):
 
 def test_warm_up_reaches_no_state_of_the_traffic(record):
     rollouts = recorded_traffic(*record).early[0].rollouts()
-    moved = elsewhere(rollouts)
-    assert [one.plan[1:] for one in moved] == [one.plan for one in rollouts]
-    assert not {one.plan[0] for one in moved} & {one.plan[0] for one in rollouts}
+    moved = [*elsewhere(rollouts, 0), *elsewhere(rollouts, 1)]
+    assert [one.plan[1:] for one in moved] == 2 * [one.plan for one in rollouts]
+    first_calls = {one.plan[0] for one in moved}
+    assert len(first_calls) == 2
+    assert not first_calls & {one.plan[0] for one in rollouts}
+    assert len({one.rollout_id for one in moved}) == len(moved)
 
 
 @pytest.mark.timeout(200)

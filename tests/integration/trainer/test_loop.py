@@ -12,7 +12,7 @@ from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import OnLost, read_settings
+from embomatrix.trainer.config.settings import OnLost, SeedPer, read_settings
 from embomatrix.trainer.grpo.update import Updater
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.lifecycle.stopwatch import Activity
@@ -254,3 +254,36 @@ def test_grpo_raises_held_out_success(tmp_path):
     )
     rows = success_rows(summary)
     assert summary.after.success().value > summary.before.success().value + 0.1, rows
+
+
+class SeedKeeper(SymbolicCluster):
+    """Stand-in that keeps the seeds of each task, of GRPO and of evaluations."""
+
+    def kept(self):
+        self.trained, self.evaluated = {}, set()
+        return self
+
+    async def execute(self, batch):
+        for rollout in batch.rollouts:
+            if batch.batch_id.startswith("step-"):
+                self.trained.setdefault(rollout.task_id, {}).setdefault(batch.step, set()).add(rollout.seed)
+            else:
+                self.evaluated.add(rollout.seed)
+        async for result in super().execute(batch):
+            yield result
+
+
+@pytest.mark.parametrize("seed_per", SeedPer)
+def test_task_keeps_its_seed_for_an_epoch_or_for_the_run(tmp_path, seed_per):
+    cluster = SeedKeeper(TASKS).kept()
+    run(tmp_path, cluster, grpo__seed_per=seed_per)
+    repeated = 0
+    for steps in cluster.trained.values():
+        assert all(len(seeds) == 1 for seeds in steps.values())
+        epochs = {(step - 1) * 4 // len(TASKS.train) for step in steps}
+        repeated += len(epochs) > 1
+        assert len(set.union(*steps.values())) == (len(epochs) if seed_per is SeedPer.EPOCH else 1)
+    assert repeated
+    trained = {seed for steps in cluster.trained.values() for seeds in steps.values() for seed in seeds}
+    assert cluster.evaluated
+    assert max(cluster.evaluated) < 2**31 <= min(trained)

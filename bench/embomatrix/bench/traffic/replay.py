@@ -49,6 +49,8 @@ class TrafficSizes:
     slots: int = 2
     rounds: int = 3
     """Replays of each phase, each through a new cluster: no call is known from the round before."""
+    warm: int = 4
+    """Rounds that reach other states first. A process copies most of its pages in its first fifty rollouts."""
     batch: int = 8
     """Groups that are submitted together, as the trainer does."""
     in_flight: int = 8
@@ -167,8 +169,8 @@ def _round(
             opened = load_generator(cluster, traffic.bundles, deadline_s - time.monotonic(), merging=sharing)
             async with opened as load:
                 await load.warm_up([group[0] for group in rollouts])
-                # Processes are forked and have copied their pages when the clock starts.
-                await _submit(load, list(map(elsewhere, rollouts)), sizes)
+                for number in range(sizes.warm):
+                    await _submit(load, [elsewhere(group, number) for group in rollouts], sizes)
                 before = CpuWatch(cluster)
                 wall_s = await _submit(load, rollouts, sizes)
                 return wall_s, before.used(), await load.close()
@@ -176,14 +178,17 @@ def _round(
         return asyncio.run(measure())
 
 
-def elsewhere(rollouts: Sequence[Rollout]) -> list[Rollout]:
-    """Return the rollouts with another first call: no state that they reach is one that the originals reach."""
-    turn = SkillCall(Skill.TURN, yaw=0.1)
+def elsewhere(rollouts: Sequence[Rollout], number: int) -> list[Rollout]:
+    """Return the rollouts with another first call, for each ``number`` a different one.
+
+    No state that they reach is one that the originals reach.
+    """
+    turn = SkillCall(Skill.TURN, yaw=0.1 * (number + 1))
     return [
         replace(
             one,
-            rollout_id=f"first/{one.rollout_id}",
-            group_id=f"first/{one.group_id}",
+            rollout_id=f"{number}/{one.rollout_id}",
+            group_id=f"{number}/{one.group_id}",
             plan=(turn, *one.plan)[:MAX_STEPS],
         )
         for one in rollouts
@@ -246,7 +251,8 @@ def _peer_round_s(
         with LIBRARIES[peer][0](setup) as contender:
             await_processes(contender, sizes.slots, sizes.start_s)
             chunks: list[RolloutChunk] = [tuple(merged(group.rollouts())) for group in groups]
-            execute(contender, [tuple(elsewhere(chunk)) for chunk in chunks], sizes.limit_s)
+            for number in range(sizes.warm):
+                execute(contender, [tuple(elsewhere(chunk, number)) for chunk in chunks], sizes.limit_s)
             outcome = execute(contender, chunks, sizes.limit_s)
             if outcome.lost or outcome.hung:
                 raise BenchError(f"{peer.value} lost {outcome.lost + outcome.hung} rollouts")
