@@ -29,7 +29,7 @@ async def finished_run(kitchen, address):
     dataset = Dataset.load(kitchen)
     record = dataset.train[0]
     digest, task, plan = record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle))
-    rollouts = [Rollout(f"x{number}", f"g{number // 8}", digest, task, plan, 0) for number in range(40)]
+    rollouts = [Rollout(f"x{number}", f"g{number // 8}", digest, task, plan, number) for number in range(40)]
     there = f"--manager={address}"
     async with ClusterClient(address) as client:
         await client.open_run("evening", "r1")

@@ -67,7 +67,7 @@ async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitc
     peak = re.fullmatch(rf"peak (\d+), {ROLLOUTS} in total", page.words["peak"])
     assert 1 < int(peak[1]) <= ROLLOUTS
     assert float(page.words["rate"]) >= 0
-    assert page.words["runs"].startswith("run done open warm failed evening <b>run</b> 24 0 ")
+    assert page.words["runs"].startswith("run done open warm shared failed evening <b>run</b> 24 0 ")
     assert ahead.words["ahead"] == f"evening <b>run</b> {short} step 7 {ROLLOUTS}"
     assert ahead.classes.count("cell warm") == 1
     assert timeline.classes.count("gantt") == 1

@@ -67,7 +67,7 @@ BEDROOM, BEDROOM_DATA = packed("a bedroom")
 
 
 def rollouts(count, *, task="t", scene=KITCHEN):
-    return tuple(Rollout(f"x{i}", "g", scene, task, (), 0) for i in range(count))
+    return tuple(Rollout(f"x{i}", "g", scene, task, (), i) for i in range(count))
 
 
 until = functools.partial(waiting.until, limit_s=10.0)

@@ -167,8 +167,9 @@ until = functools.partial(waiting.until, limit_s=60.0)
 
 
 def batch_of(run_id, count, task="ok", batch_id="b1", group=8):
+    """Return a batch without equal rollouts: each is executed."""
     rollouts = tuple(
-        Rollout(f"{batch_id}-{number}", f"g{number // group}", DIGEST, task, (), number // group)
+        Rollout(f"{batch_id}-{number}", f"g{number // group}", DIGEST, task, (), number)
         for number in range(count)
     )
     return Batch(run_id, batch_id, 0, rollouts)

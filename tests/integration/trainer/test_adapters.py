@@ -42,14 +42,14 @@ def on_cluster(cluster):
         yield opened
 
 
-async def test_texts_of_several_tasks_are_scored_in_order_with_one_batch_per_task(cluster, on_cluster):
+async def test_texts_of_several_tasks_are_scored_in_order_as_one_batch(cluster, on_cluster):
     texts = [oracle(FIRST), "no plan", oracle(SECOND), "toggle_on 0"]
     ids = [FIRST.task.task_id, SECOND.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
     outcomes = await on_cluster.score(ids, texts)
     assert [outcome.text for outcome in outcomes] == texts
     assert [outcome.success for outcome in outcomes] == [True, False, True, False]
     assert outcomes[1].value == -1
-    assert (len(cluster.batches), cluster.executed) == (2, 3)
+    assert (len(cluster.batches), cluster.executed) == (1, 3)
 
 
 async def test_scorer_serves_several_event_loops(on_cluster):
@@ -102,7 +102,7 @@ def test_missing_token_file_gives_a_one_sentence_error(tmp_path):
 
 
 async def test_trl_gets_a_reward_per_completion_and_none_for_a_lost_one():
-    lossy = SymbolicCluster(TASKS, lost=frozenset({"score-0/1"}))
+    lossy = SymbolicCluster(TASKS, lost=frozenset({"score-0/0/1"}))
     metrics, columns = {}, {}
     with scorer(lossy) as opened:
         rewards = await ClusterReward(opened)(

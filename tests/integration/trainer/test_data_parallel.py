@@ -92,7 +92,7 @@ def test_ctrl_c_waits_for_neither_rewards_nor_processes(tmp_path, remotes, inter
         """Cluster that withholds the rewards of GRPO's third step and interrupts the trainer."""
 
         async def execute(self, batch):
-            if batch.batch_id == "step-3-0-0":
+            if batch.batch_id == "step-3-0":
                 asyncio.get_running_loop().call_later(0.3, os.kill, os.getpid(), signal.SIGINT)
             if batch.batch_id.startswith("step-3-"):
                 await asyncio.Event().wait()

@@ -231,13 +231,13 @@ class RunEventLog:
         code, message, timings = "", "", None
         if isinstance(result.outcome, Completed):
             timings = lease.timings(result.outcome.timings, now_s)
-            worker.completed += 1
+            worker.completed += record.count
             worker.execute_s += timings.execute_s
             worker.load_s += timings.load_s
             self.hedges_won += result.ref.lease_id in self._hedges
         else:
             code, message = result.outcome.code.value, result.outcome.message[:MESSAGE_CHARS]
-            worker.failed += 1
+            worker.failed += record.count
         self._hedges.pop(result.ref.lease_id, None)
         if record.rollout.is_turn and code in ("", InfraCode.PREFIX_MISMATCH):
             return  # its client has the answer, and thousands of turns a second would displace all other events
