@@ -116,6 +116,7 @@ class LeaseMachine(RuleBasedStateMachine):
                 case DeliverResult(result=result):
                     assert result.rollout_id in self.submitted
                     assert result.rollout_id not in self.delivered, "a second outcome"
+                    assert result.also == self.submitted[result.rollout_id].also
                     self.delivered[result.rollout_id] = result
                 case GiveLease():
                     assert command.ref.lease_epoch not in self.epochs, "an epoch given twice"
@@ -191,11 +192,22 @@ class LeaseMachine(RuleBasedStateMachine):
         scene=st.sampled_from(SCENES),
         render=st.sampled_from([False, False, True]),
         piece=st.sampled_from([None, None, 1, 3]),
+        equal=st.sampled_from([0, 0, 1, 3]),
     )
-    def batch_is_submitted(self, run, count, size, scene, render, piece):
+    def batch_is_submitted(self, run, count, size, scene, render, piece, equal):
         name = f"b{len(self.batches)}"
         rollouts = tuple(
-            Rollout(f"{name}-{i}", f"{name}.{i // size}", scene, "t", (), 0, render) for i in range(count)
+            Rollout(
+                f"{name}-{i}",
+                f"{name}.{i // size}",
+                scene,
+                "t",
+                (),
+                0,
+                render,
+                tuple(f"{name}-{i}-{number}" for number in range(equal)),
+            )
+            for i in range(count)
         )
         self.submitted.update({rollout.rollout_id: rollout for rollout in rollouts})
         self.batches[name] = batch = Batch(run, name, len(self.batches) + 1, rollouts)
@@ -283,14 +295,21 @@ class LeaseMachine(RuleBasedStateMachine):
         for held in leases.values():
             assert len({lease.worker_id for lease in held}) == len(held) <= 2
             assert len(held) == 1 or held[0].record.hedged
-        assert len(leases) + dispatcher.queued == len(self.submitted) - len(self.delivered)
-        assert sum(map(dispatcher.pending_of, RUNS)) == len(self.submitted) - len(self.delivered)
+        leased = sum(held[0].record.count for held in leases.values())
+        left = sum(one.count for one in self.submitted.values())
+        left -= sum(result.count for result in self.delivered.values())
+        assert leased + dispatcher.queued == left
+        assert sum(map(dispatcher.pending_of, RUNS)) == left
 
     @invariant()
     def hedges_keep_to_their_budget(self):
         if hasattr(self, "cluster"):
             counted = sum(self.cluster.dispatcher.counters(run).hedged for run in RUNS)
-            assert counted == self.hedges <= LIMITS.hedge_share * len(self.submitted)
+            assert (
+                counted
+                == self.hedges
+                <= LIMITS.hedge_share * sum(one.count for one in self.submitted.values())
+            )
 
     @invariant()
     def cancellations_have_a_reason(self):

@@ -160,7 +160,8 @@ class Dispatcher:
     def queued(self) -> int:
         """Number of rollouts that wait for a lease."""
         state = self.state
-        awaited = sum(record.phase is not DispatchPhase.DONE for record in state.awaited.values())
+        records = state.awaited.values()
+        awaited = sum(record.count for record in records if record.phase is not DispatchPhase.DONE)
         return len(state.queues) + state.batches.coming + awaited
 
     @property

@@ -22,12 +22,13 @@ class PendingQueues:
         self._heaps: dict[str, dict[QueueKey, _Heap]] = {}
         #: Entries whose record is not PENDING are stale and skipped at the head.
         self._counts: Counter[str] = Counter()
-        #: Waiting rollouts by scene; no zero entries.
+        #: Waiting records by scene; no zero entries.
         self._by_run: Counter[str] = Counter()
         #: Waiting rollouts by run; no zero entries.
         self._numbers = itertools.count()
 
     def __len__(self) -> int:
+        """Number of waiting rollouts."""
         return sum(self._by_run.values())
 
     def __iter__(self) -> Iterator[RolloutRecord]:
@@ -55,7 +56,7 @@ class PendingQueues:
         heap = self._heaps.setdefault(record.scene, {}).setdefault(record.queue, [])
         heapq.heappush(heap, (record.sequence, next(self._numbers), record))
         self._counts[record.scene] += 1
-        self._by_run[record.key.run_id] += 1
+        self._by_run[record.key.run_id] += record.count
 
     def heads(self, scene: str) -> list[RolloutRecord]:
         """Return the first rollout of each queue of the scene, in order of turns."""
@@ -91,7 +92,7 @@ class PendingQueues:
         """Count a waiting record no more. The caller changes its phase, which makes its heap entry stale."""
         scene, run_id = record.scene, record.key.run_id
         self._counts[scene] -= 1
-        self._by_run[run_id] -= 1
+        self._by_run[run_id] -= record.count
         if not self._by_run[run_id]:
             del self._by_run[run_id]
         if not self._counts[scene]:
@@ -103,7 +104,10 @@ class PendingQueues:
         """Raise AssertionError if a count disagrees with the queues."""
         waiting = set(self)
         assert Counter(record.scene for record in waiting) == self._counts
-        assert Counter(record.key.run_id for record in waiting) == self._by_run
+        by_run: Counter[str] = Counter()
+        for record in waiting:
+            by_run[record.key.run_id] += record.count
+        assert by_run == self._by_run
         assert not any(record.leases or record.held for record in waiting)
 
 
