@@ -3,10 +3,10 @@
 import asyncio
 import contextlib
 import functools
-import gc
 
 import pytest
 from tests.fakes import waiting
+from tests.fakes.living import alive
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BUNDLES, KITCHEN, manager
 
@@ -68,12 +68,6 @@ async def settled(client):
             return
         await asyncio.sleep(0.05)
     raise TimeoutError("turns are pending after 10 s")
-
-
-def alive(kind):
-    """Number of objects of a type in this process, those of other tests included."""
-    gc.collect()
-    return sum(type(item) is kind for item in gc.get_objects())
 
 
 async def test_each_turn_has_one_result_in_order(tmp_path):

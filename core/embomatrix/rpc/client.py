@@ -181,9 +181,9 @@ class ClusterClient(AdminClient):
         raises ``DeadlineError``.
         """
         within_s = self._limits.batch_s if deadline_s is None else deadline_s
-        attached = _AttachedBatch(batch, within_s)
         if self._merges:
-            attached.batch = dataclasses.replace(batch, rollouts=tuple(merged(batch.rollouts)))
+            batch = dataclasses.replace(batch, rollouts=tuple(merged(batch.rollouts)))
+        attached = _AttachedBatch(batch, within_s)
         backoff = Backoff(self._limits.retry_first_s, self._limits.retry_longest_s)
         while attached.missing:
             before, cursor = len(attached.missing), attached.cursor

@@ -245,12 +245,16 @@ class Simulator:
         """Reset and run the plan to its end or first failed step. ``on_step`` receives the number of finished steps."""
         self.reset(task, seed)
         steps: list[Step] = []
-        for call in plan:
+        self._run_to_failure(plan, steps, on_step)
+        return self.trace(task, plan, steps)
+
+    def _run_to_failure(self, calls: Plan, steps: list[Step], on_step: Callable[[int], None]) -> None:
+        """Run the calls to their end or first failed one, and append their steps."""
+        for call in calls:
             steps.append(self.run_step(call))
             on_step(len(steps))
             if not steps[-1].ok:
                 break
-        return self.trace(task, plan, steps)
 
     def trace(self, task: Task, plan: Plan, steps: Sequence[Step]) -> Trace:
         """Return the trace of a plan whose steps led to the present state."""
@@ -272,11 +276,7 @@ class Simulator:
             steps.append(self.run_step(call))
             on_step(len(steps))
         start, before = self.mark(), self.world.mark()
-        for call in plan[prefix:]:
-            steps.append(self.run_step(call))
-            on_step(len(steps))
-            if not steps[-1].ok:
-                break
+        self._run_to_failure(plan[prefix:], steps, on_step)
         end = self.mark()
         digests = start.digest(seed), end.digest(seed)
         return TurnRun(tuple(steps), *digests, end.touched, self.observe(task, before))

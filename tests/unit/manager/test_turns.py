@@ -1,9 +1,8 @@
 """Turns of episodes in the dispatcher: independent of each other, tried on one other worker after a mismatch, and forgotten."""
 
-import gc
-
 import pytest
 from tests.fakes.dispatch import Table, crash, leases
+from tests.fakes.living import alive
 from tests.fakes.worker import completed, completed_turn
 
 from embomatrix.manager.control.dispatch.batches import FINISHED_KEPT
@@ -42,12 +41,6 @@ def turn_batch(count=1, batch_id="turns-1"):
 def answered(table, commands):
     for lease in leases(commands):
         table.finish(lease, completed_turn(lease.rollout, lease.worker_id))
-
-
-def alive(kind):
-    """Number of objects of a type in this process, those of other tests included."""
-    gc.collect()
-    return sum(type(item) is kind for item in gc.get_objects())
 
 
 @pytest.fixture

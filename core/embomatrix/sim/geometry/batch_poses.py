@@ -87,8 +87,9 @@ class PoseBoxes:
             yield Aabb((a, b, c), (d, e, f))
 
     def corners(self) -> list[list[float]]:
-        """Return the low and then the high corner of each."""
-        return np.concatenate([self.lows_m, self.highs_m], axis=1).tolist()  # type: ignore[no-any-return]  # six floats each
+        """Return the low and then the high corner of each, six floats."""
+        found: list[list[float]] = np.concatenate([self.lows_m, self.highs_m], axis=1).tolist()
+        return found
 
     def at(self, rows: Sequence[int]) -> PoseBoxes:
         """Some of the poses, in the order of ``rows``."""

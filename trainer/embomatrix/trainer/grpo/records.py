@@ -65,6 +65,7 @@ def record_of(
     known = [outcome for outcome in outcomes if outcome.reward is not None]
     rewards = [outcome.reward for outcome in known if outcome.reward is not None]
     executed = [outcome.outcome for outcome in known if isinstance(outcome.outcome, Completed)]
+    steps = sum(len(outcome.steps) for outcome in executed)
     weight = sum(part.weight for part in metrics)
 
     def over_tokens(name: str) -> float | None:
@@ -93,13 +94,8 @@ def record_of(
         rollouts=len(outcomes),
         lost=len(outcomes) - len(known),
         warm=_mean([outcome.warm for outcome in executed]),
-        shared=_mean([share for outcome in executed for share in _shared(outcome)]),
+        shared=sum(outcome.shared_steps for outcome in executed) / max(1, steps),
     )
-
-
-def _shared(outcome: Completed) -> list[bool]:
-    """Truth for each step of whether it was shared."""
-    return [number < outcome.shared_steps for number in range(len(outcome.steps))]
 
 
 def _by_category(logs: Sequence[GroupLog]) -> dict[str, float]:

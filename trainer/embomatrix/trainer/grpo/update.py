@@ -103,8 +103,9 @@ class Updater:
     def _chunks(self, plan: StepPlan) -> list[SampledChunk]:
         """Return this step's chunks, sampled now or one step ago. With ``AHEAD``, also sample the next step's."""
         ready, self._ahead = self._ahead, None
-        sampled = ready is not None and ready[0] == plan.step
-        chunks = ready[1] if ready and sampled else self._sample(plan, plan.step, plan.tasks)
+        step, chunks = ready or (0, [])
+        if step != plan.step:
+            chunks = self._sample(plan, plan.step, plan.tasks)
         if self._settings.overlap is Overlap.AHEAD and plan.upcoming:
             coming = plan.step + 1
             self._ahead = coming, self._sample(plan, coming, plan.upcoming)
