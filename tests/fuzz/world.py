@@ -9,7 +9,6 @@ import zlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from tests.fakes.bddl_text import render_problem
 from tests.fakes.tiny_scene import tiny_bundle, tiny_task
 from tests.fuzz.decoder import (
     Decoder,
@@ -30,7 +29,7 @@ from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_ob
 from embomatrix.rpc.wire.rollout import skill_call_from_proto, skill_call_to_proto
 from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json, plan_to_json, plan_to_lines
 from embomatrix.skills.prompt import Codec, prompt_for, situation_of
-from embomatrix.world.bddl import BddlError, parse_formula, parse_problem
+from embomatrix.world.bddl import BddlError, parse_formula, parse_problem, render_problem
 from embomatrix.world.bundle import decode_bundle, encode_bundle
 from embomatrix.world.bundle_head import HEAD, MAGIC, read_profiles
 from embomatrix.world.codec import asset_from_json, asset_to_json, scene_from_json, scene_to_json

@@ -170,6 +170,21 @@ def parse_problem(text: str) -> BddlProblem:
     return problem
 
 
+def render_problem(problem: BddlProblem) -> str:
+    """Return BDDL text that `parse_problem` reads as an equal problem."""
+    grouped: dict[str, list[str]] = {}
+    for name, type_name in problem.objects.items():
+        grouped.setdefault(type_name, []).append(name)
+    objects = "\n".join(f"        {' '.join(names)} - {type_name}" for type_name, names in grouped.items())
+    init = "\n".join(
+        f"        {render(item.atom if item.positive else Not(item.atom))}" for item in problem.init
+    )
+    return (
+        f"(define (problem {problem.name})\n    (:domain omnigibson)\n    (:objects\n{objects}\n    )\n"
+        f"    (:init\n{init}\n    )\n    (:goal\n        {render(problem.goal)}\n    )\n)\n"
+    )
+
+
 def parse_formula(text: str, objects: Mapping[str, str]) -> Formula:
     """Read one formula over ``objects`` (name to type). Raises BddlError."""
     return _Reader(objects, frozenset(objects.values())).formula(_read(text), {})

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.fakes.bddl_text import render_problem
 from tests.fakes.formulas import exists, forall, forn, forpairs
 
-from embomatrix.world.bddl import BddlError, BddlProblem, parse_formula, parse_problem
+from embomatrix.world.bddl import BddlError, BddlProblem, parse_formula, parse_problem, render_problem
 from embomatrix.world.evaluate import render
 from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or
 

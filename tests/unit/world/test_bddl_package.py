@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.fakes.bddl_text import render_problem
 from tests.fakes.formulas import exists, forall, forn, forpairs
 
-from embomatrix.world.bddl import WILDCARD, BddlProblem, InitLiteral, parse_problem
+from embomatrix.world.bddl import WILDCARD, BddlProblem, InitLiteral, parse_problem, render_problem
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified
 

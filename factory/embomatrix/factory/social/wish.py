@@ -74,8 +74,8 @@ class WishedObjects(StrictModel):
 
     label: str = Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")
     kind: str = Field(min_length=1, max_length=60)
-    count: int = Field(1, ge=1, le=MAX_COUNT)
-    room: str = Field("", max_length=64)
+    count: int = Field(default=1, ge=1, le=MAX_COUNT)
+    room: str = Field(default="", max_length=64)
     relation: Relation | None = None
     host: str = ""
     furniture: bool = False
@@ -96,7 +96,7 @@ class Condition(StrictModel):
     things: str
     place: str = ""
     quantity: Quantity = Quantity.ALL
-    count: int = Field(0, ge=0, le=MAX_COUNT)
+    count: int = Field(default=0, ge=0, le=MAX_COUNT)
     holds: bool = True
     otherwise: Condition | None = None
     provided: Condition | None = None

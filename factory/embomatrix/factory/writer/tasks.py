@@ -185,10 +185,13 @@ def _conjunction(parts: list[Formula]) -> Formula:
     return flat[0] if len(flat) == 1 else And(tuple(flat))
 
 
-def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generator) -> tuple[str, ...]:
+def object_table(
+    view: SceneView, needed: Sequence[str], rng: np.random.Generator, *, elsewhere: bool = False
+) -> tuple[str, ...]:
     """Return the needed objects with their supports, and distractors of the same rooms, shuffled.
 
-    Distractors are added with their supports, so the place of each row can always be stated.
+    Distractors are added with their supports, so the place of each row can always be stated. With ``elsewhere``, objects of
+    other rooms fill a table that the same rooms leave short.
     """
     rows: dict[str, None] = {}
 
@@ -197,14 +200,16 @@ def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generato
 
     for name in needed:
         add(name)
-    rooms = dict.fromkeys(view.room(name) for name in needed)
-    others = [name for room in rooms for name in view.in_room.get(room, ())]
-    telling = [name for name in others if _is_useful(view, name)]
     wanted = int(rng.integers(ROWS[0], ROWS[1] + 1))
-    for name in rng.permutation(telling) if telling else ():
-        if len(rows) >= wanted:
-            break
-        add(str(name))
+    near = dict.fromkeys(view.room(name) for name in needed)
+    far = [room.name for room in view.scene.rooms if room.name not in near] if elsewhere else []
+    for rooms in ([*near], far):
+        others = [name for room in rooms for name in view.in_room.get(room, ())]
+        telling = [name for name in others if _is_useful(view, name)]
+        for name in rng.permutation(telling) if telling else ():
+            if len(rows) >= wanted:
+                break
+            add(str(name))
     table = list(rows)
     return tuple(table[int(index)] for index in rng.permutation(len(table)))[:MAX_TABLE]
 

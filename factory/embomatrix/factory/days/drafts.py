@@ -1,0 +1,211 @@
+"""Drafts of tasks from the needs of a day: goal, object table and instruction in a scene that is laid out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from embomatrix.factory.days.laying import SOURCE, DayScene
+from embomatrix.factory.faithfulness.clauses import goal_clauses
+from embomatrix.factory.language.clauses import PhraseBook
+from embomatrix.factory.language.references import Describer
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.day import NeedOfDay
+from embomatrix.factory.social.dialogue import conversation, transcript_of
+from embomatrix.factory.social.telling import Asked, Teller, UndescribableError
+from embomatrix.factory.social.values import Cast
+from embomatrix.factory.social.wish import Condition, Quantity, goal_of
+from embomatrix.factory.task_import.reach import profile_for
+from embomatrix.factory.task_import.task_fields import category_of, signature_of, sources_for, taps_for
+from embomatrix.factory.writer.tasks import Draft, object_table
+from embomatrix.factory.writer.words import FreshVoice
+from embomatrix.skills.prompt import situation_of
+from embomatrix.world.evaluate import render, types_of
+from embomatrix.world.task import Task
+
+Members = Mapping[str, tuple[str, ...]]
+NEEDS_OF_TASK: Final = (1, 1, 1, 2, 2, 3)
+"""Numbers of needs that one task joins; each entry is equally likely."""
+MAX_ROWS: Final = 40
+"""Maximum number of rows of a table, so that a person can read the prompt."""
+
+
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """Needs of one event that one task joins, with the objects of each need by label."""
+
+    needs: tuple[NeedOfDay, ...]
+    members: tuple[Members, ...]
+
+
+def combinations_of(day: DayScene, rng: np.random.Generator) -> list[Combination]:
+    """Return the needs of the day in groups of one event. Each need belongs to one group."""
+    found: list[Combination] = []
+    by_event: dict[str, list[int]] = {}
+    for number, need in enumerate(day.needs):
+        by_event.setdefault(need.event.name, []).append(number)
+    for numbers in by_event.values():
+        left = [numbers[int(at)] for at in rng.permutation(len(numbers))]
+        while left:
+            size = min(len(left), NEEDS_OF_TASK[int(rng.integers(len(NEEDS_OF_TASK)))])
+            chosen, left = left[:size], left[size:]
+            needs = tuple(day.needs[at] for at in chosen)
+            found.append(Combination(needs, tuple(day.members[at] for at in chosen)))
+    return found
+
+
+class DraftWriter:
+    """Writer of drafts in the scene of a day. ``voice`` prefers the phrases that were used least."""
+
+    def __init__(self, day: DayScene, cast: Cast, split: str, seed: int, voice: FreshVoice) -> None:
+        self._cast = cast
+        self._view = SceneView(day.scene)
+        self._split = split
+        self._seed = seed
+        self._voice = voice
+        self._book = PhraseBook(split, seed)
+
+    def draft(self, task_id: str, combination: Combination) -> Draft | None:
+        """Return the draft of a task; None if its objects can't be told apart.
+
+        Words that fit several equal pieces of furniture mean any of them, and so does the goal.
+        """
+        conditions, members, about = self._joined(combination)
+        task = self._task(task_id, conditions, members, about)
+        while (unclear := self._unclear(task, members)) is not None:
+            alike = self._alike(members[unclear])
+            if len(alike) == len(members[unclear]):
+                return None
+            names = members[unclear]
+            members = {label: alike if each == names else each for label, each in members.items()}
+            conditions = [_of_any(each) if members[each.things] == alike else each for each in conditions]
+            about = tuple(dict.fromkeys((*about, *alike)))
+            task = self._task(task_id, conditions, members, about)
+        if len(task.table) > MAX_ROWS:
+            return None
+        told = self._told(task, combination, conditions, members)
+        if told is None:
+            return None
+        instruction, transcript = told
+        return Draft(
+            task=replace(task, instruction=instruction),
+            about=task.table,
+            rooms=tuple(sorted({self._view.room(name) for names in members.values() for name in names})),
+            signature=signature_of(task.goal, self._view),
+            intent=goal_clauses(task.goal, task.types),
+            transcript=transcript,
+        )
+
+    def _joined(
+        self, combination: Combination
+    ) -> tuple[list[Condition], dict[str, tuple[str, ...]], tuple[str, ...]]:
+        """Return the conditions of all needs with labels that are unique across them, and all objects."""
+        conditions: list[Condition] = []
+        members: dict[str, tuple[str, ...]] = {}
+        for number, (need, names) in enumerate(zip(combination.needs, combination.members, strict=True)):
+            for condition in need.wish.conditions:
+                labels = {"things": f"{condition.things}_{number}"}
+                if condition.place:
+                    labels["place"] = f"{condition.place}_{number}"
+                members |= {new: names[getattr(condition, field)] for field, new in labels.items()}
+                conditions.append(condition.model_copy(update=labels))
+        about = dict.fromkeys(
+            name for need in combination.members for names in need.values() for name in names
+        )
+        return conditions, members, tuple(about)
+
+    def _task(
+        self, task_id: str, conditions: Sequence[Condition], members: Members, about: tuple[str, ...]
+    ) -> Task:
+        types = self._types(conditions, members)
+        goal = goal_of(conditions, members, types)
+        used = {types[label]: members[label] for label in types if types[label] in types_of(goal)}
+        known = tuple(dict.fromkeys(name for names in members.values() for name in names))
+        taps = taps_for(self._view, goal, about)
+        needed = dict.fromkeys((*about, *sources_for(self._view, goal, used, known), *taps))
+        return Task(
+            task_id=task_id,
+            scene_id=self._view.scene.scene_id,
+            instruction="",
+            category=category_of(goal),
+            goal=goal,
+            goal_bddl=render(goal),
+            table=object_table(
+                self._view, tuple(needed), np.random.default_rng(_seed_of(task_id)), elsewhere=True
+            ),
+            types=used,
+            source=SOURCE,
+            profile=profile_for(goal),
+        )
+
+    def _unclear(self, task: Task, members: Members) -> str | None:
+        """Return the label of objects that no description distinguishes from other rows."""
+        describer = self._describer(task, members)
+        return next((label for label, names in members.items() if describer.describe(names) is None), None)
+
+    def _alike(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return all furniture of the same category in the same room; the same names for other objects."""
+        if len(names) > 1 or not self._view.item(names[0]).fixed:
+            return names
+        return self._view.alike(names[0])
+
+    def _describer(self, task: Task, members: Members) -> Describer:
+        rows = {row.name: row for row in situation_of(self._view.scene, task).rows}
+        loose = (name for names in members.values() for name in names if not rows[name].fixed)
+        return Describer(
+            rows=rows,
+            rooms=[room.name for room in self._view.scene.rooms],
+            voice=self._voice,
+            split=self._split,
+            seed=self._seed,
+            taken=frozenset(loose),
+        )
+
+    def _told(
+        self, task: Task, combination: Combination, conditions: Sequence[Condition], members: Members
+    ) -> tuple[str, str] | None:
+        """Return the instruction and the conversation behind it; None if the objects can't be told apart."""
+        teller = Teller(self._describer(task, members), self._book, self._voice)
+        asked = []
+        for number, (need, names) in enumerate(zip(combination.needs, combination.members, strict=True)):
+            suffix = f"_{number}"
+            changed = {
+                label.removesuffix(suffix): each for label, each in members.items() if label.endswith(suffix)
+            }
+            own = [_without(each, suffix) for each in conditions if each.things.endswith(suffix)]
+            asked.append(Asked(need, {**names, **changed}, own))
+        try:
+            instruction = teller.instruction(asked)
+            turns = conversation(asked, teller, self._voice)
+        except UndescribableError:
+            return None
+        return instruction, transcript_of(self._cast, asked, turns, instruction, task.goal_bddl)
+
+    def _types(self, conditions: Sequence[Condition], members: Members) -> dict[str, str]:
+        """Return a type for each group that a quantifier ranges over. Groups whose type is taken are written out."""
+        types: dict[str, str] = {}
+        for condition in conditions:
+            for label in (condition.things, condition.place):
+                if not label or (len(members[label]) < 2 and condition.quantity is not Quantity.PAIRED):
+                    continue
+                synset = self._view.asset(members[label][0]).synset
+                taken = {members[other] for other, known in types.items() if known == synset}
+                if not taken or taken == {members[label]}:
+                    types[label] = synset
+        return types
+
+
+def _of_any(condition: Condition) -> Condition:
+    return condition.model_copy(update={"quantity": Quantity.ANY})
+
+
+def _without(condition: Condition, suffix: str) -> Condition:
+    labels = {"things": condition.things.removesuffix(suffix), "place": condition.place.removesuffix(suffix)}
+    return condition.model_copy(update=labels)
+
+
+def _seed_of(task_id: str) -> list[int]:
+    return list(task_id.encode())

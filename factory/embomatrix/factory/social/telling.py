@@ -1,0 +1,258 @@
+"""Instruction for the needs of a task: who asks and why, then each request in words that fit exactly its objects.
+
+A request is told by its clauses, or by a sentence that implies them. The describer sees the rows of the prompt only.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from embomatrix.factory.language.clauses import (
+    Clause,
+    NounPhrase,
+    PhraseBook,
+    Speaker,
+    capitalised,
+    imperative_of,
+    sentence_of,
+)
+from embomatrix.factory.language.nouns import noun_of, number_word
+from embomatrix.factory.language.references import Describer, all_of, any_of, exactly, together
+from embomatrix.factory.social.day import NeedOfDay
+from embomatrix.factory.social.household import is_female
+from embomatrix.factory.social.wish import PLACED, THERMAL, Condition, Quantity, WishPredicate
+from embomatrix.factory.writer.words import Voice
+
+IMPLIED_SHARE: Final = 0.5
+"""Share of needs told by a sentence that implies the conditions, if the need has one."""
+FIRST_PERSON_SHARE: Final = 0.5
+PRONOUN_SHARE: Final = 0.8
+WHENCE_SHARE: Final = 0.6
+TOGETHER_SHARE: Final = 0.6
+"""Share of requests with the same place that are told in one clause."""
+LIGHTS: Final = frozenset({"table_lamp", "floor_lamp"})
+TAPS: Final = ("_sink", "bathtub")
+_CHOICE: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
+_NAME: Final = re.compile(r"\{(\w+)\}")
+_GREETINGS: Final = ("{name} here. ", "This is {name}. ", "It's {name}. ", "Hello, {name} speaking. ")
+
+
+class UndescribableError(Exception):
+    """Objects that no description distinguishes from the other rows of the prompt."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Need with the rows that its labels stand for, and its conditions on them."""
+
+    need: NeedOfDay
+    members: Mapping[str, tuple[str, ...]]
+    conditions: Sequence[Condition]
+
+
+@dataclass(frozen=True)
+class Teller:
+    """Teller of needs to the robot."""
+
+    describer: Describer
+    book: PhraseBook
+    voice: Voice
+
+    def instruction(self, asked: Sequence[Asked]) -> str:
+        """Return the instruction for needs of one event. Raise UndescribableError."""
+        first = asked[0].need
+        speaker = Speaker() if self._rng() < FIRST_PERSON_SHARE else Speaker(first.person.name)
+        greeting = "" if speaker.name else self.voice.choose(_GREETINGS).format(name=first.person.name)
+        why = self._personal(self.voice.choose(first.event.why), first, speaker)
+        is_named = bool(speaker.name) and speaker.name in why
+        later = Speaker("She" if is_female(speaker.name) else "He") if is_named else speaker
+        said = [sentence for each in asked for sentence in self._requests(each, later)]
+        return f"{greeting}{capitalised(why)} {self._joined(said, speaker.name)}"
+
+    def reason(self, need: NeedOfDay) -> str:
+        """Return a sentence about the event in the first person."""
+        return self._personal(self.voice.choose(need.event.why), need, Speaker())
+
+    def _rng(self) -> float:
+        return float(self.voice.rng.random())
+
+    def _joined(self, sentences: Sequence[str], name: str) -> str:
+        """Return the sentences with joints before some of them. ``name`` is the speaker's."""
+        told = []
+        for number, sentence in enumerate(sentences):
+            last = number == len(sentences) - 1
+            kind = "first" if not number else "last" if last else "next"
+            is_plain = len(sentences) > 1 and not sentence.startswith(("In the end", "When you"))
+            joint = self.voice.choose(self.book.joints(kind)) if is_plain else ""
+            told.append(f"{joint}{_lowered(sentence, (name,))}" if joint else sentence)
+        return " ".join(told)
+
+    def _requests(self, asked: Asked, speaker: Speaker) -> list[str]:
+        if asked.need.need.say and self._rng() < IMPLIED_SHARE:
+            return [self._implied(asked, speaker)]
+        return self._clauses(asked, speaker)
+
+    def _implied(self, asked: Asked, speaker: Speaker) -> str:
+        text = self._personal(self.voice.choose(asked.need.need.say), asked.need, speaker)
+
+        def words(match: re.Match[str]) -> str:
+            label = match.group(1)
+            return number_word(asked.need.count) if label == "k" else self._definite(asked.members[label])
+
+        sentences = re.split(r"(?<=[.!?]) ", _NAME.sub(words, text))
+        return " ".join(map(capitalised, sentences))
+
+    def _personal(self, text: str, need: NeedOfDay, speaker: Speaker) -> str:
+        """Fill in the person, their pronouns and the time."""
+        text = _CHOICE.sub(lambda match: self._choice(match, need, speaker), text)
+        their = "her" if is_female(need.person.name) else "his"
+        them = "her" if is_female(need.person.name) else "him"
+        fields = {
+            "I": speaker.name or "I",
+            "my": f"{speaker.name}'s" if speaker.name else "my",
+            "their": their if speaker.name else "my",
+            "me": them if speaker.name else "me",
+            "time": need.time,
+        }
+        return _NAME.sub(lambda match: fields.get(match.group(1), match.group(0)), text)
+
+    def _choice(self, match: re.Match[str], need: NeedOfDay, speaker: Speaker) -> str:
+        first, third = match.groups()
+        if third == "their":
+            third = "her" if is_female(need.person.name) else "his"
+        return third if speaker.name else first
+
+    def _definite(self, names: Sequence[str]) -> str:
+        words = self.describer.definite(names)
+        if not words:
+            raise UndescribableError(", ".join(names))
+        return words
+
+    def _clauses(self, asked: Asked, speaker: Speaker) -> list[str]:
+        """Return a sentence for each condition. Conditions with the same place may share one; repeated things are pronouns."""
+        said: list[str] = []
+        before: frozenset[str] = frozenset()
+        for group in self._grouped([each for each in asked.conditions if not _is_implied(each, asked)]):
+            names = frozenset(name for each in group for name in asked.members[each.things])
+            counted = group[0].quantity in (Quantity.ANY, Quantity.EXACTLY, Quantity.PAIRED)
+            bare = names == before and not counted and self._rng() < PRONOUN_SHARE
+            said.append(
+                sentence_of(self._clause(group, asked.members, bare=bare), self.book, self.voice, speaker)
+            )
+            before = names if not counted or len(names) == 1 else frozenset()
+        return said
+
+    def _grouped(self, conditions: Sequence[Condition]) -> list[list[Condition]]:
+        groups: list[list[Condition]] = []
+        for condition in conditions:
+            last = groups[-1][-1] if groups else None
+            same = (
+                last is not None
+                and condition.predicate in PLACED
+                and last.quantity is condition.quantity is Quantity.ALL
+                and (last.predicate, last.place) == (condition.predicate, condition.place)
+            )
+            if same and self._rng() < TOGETHER_SHARE:
+                groups[-1].append(condition)
+            else:
+                groups.append([condition])
+        return groups
+
+    def _clause(
+        self, group: Sequence[Condition], members: Mapping[str, tuple[str, ...]], *, bare: bool
+    ) -> Clause:
+        first = group[0]
+        names = [name for each in group for name in members[each.things]]
+        pronoun = NounPhrase("it" if len(names) == 1 else "them", len(names))
+        thing = pronoun if bare else self._things(group, members)
+        place = self._place(first, members) if first.place else ""
+        whence = ""
+        if (
+            first.quantity is Quantity.ALL
+            and len({self._host(name) for name in names}) == 1
+            and self._rng() < WHENCE_SHARE
+        ):
+            whence = self.describer.place_words(names[0])
+        if whence and noun_of(self.describer.rows[self._host(names[0])].category).one in thing.words:
+            whence = ""
+        return Clause(self._key(first, names), thing, place, whence, bare)
+
+    def _host(self, name: str) -> str:
+        return self.describer.rows[name].host
+
+    def _key(self, condition: Condition, names: Sequence[str]) -> str:
+        holds = condition.holds and condition.quantity is not Quantity.NONE
+        key = condition.predicate.value if holds else f"not {condition.predicate.value}"
+        if condition.predicate is WishPredicate.TOGGLED_ON:
+            category = self.describer.rows[names[0]].category
+            if category in LIGHTS:
+                return f"{key} light"
+            if category.endswith(TAPS):
+                return f"{key} tap"
+        return key
+
+    def _things(self, group: Sequence[Condition], members: Mapping[str, tuple[str, ...]]) -> NounPhrase:
+        if len(group) > 1:
+            every = [name for each in group for name in members[each.things]]
+            of_kind = self.describer.describe(every)
+            if of_kind is not None and self._rng() < TOGETHER_SHARE:
+                return all_of(self.describer, of_kind, len(every))
+            return together([self._quantified(each, members[each.things]) for each in group])
+        return self._quantified(group[0], members[group[0].things])
+
+    def _quantified(self, condition: Condition, names: Sequence[str]) -> NounPhrase:
+        found = self.describer.describe(names)
+        if found is None:
+            raise UndescribableError(", ".join(names))
+        match condition.quantity:
+            case Quantity.ANY:
+                return (
+                    any_of(self.describer, found, len(names))
+                    if len(names) > 1
+                    else all_of(self.describer, found, 1)
+                )
+            case Quantity.EXACTLY:
+                return exactly(self.describer, found, condition.count, len(names))
+            case Quantity.PAIRED:
+                return NounPhrase(self.describer.phrase(found, len(names), "one of the"))
+            case _:
+                return all_of(self.describer, found, len(names))
+
+    def _place(self, condition: Condition, members: Mapping[str, tuple[str, ...]]) -> str:
+        names = members[condition.place]
+        found = self.describer.describe(names)
+        if found is None:
+            raise UndescribableError(", ".join(names))
+        if condition.quantity is Quantity.PAIRED:
+            return self.describer.phrase(found, 1, "each")
+        if len(names) == 1:
+            return self.describer.phrase(found, 1)
+        kind = "any of the" if condition.predicate not in THERMAL else "one of the"
+        return self.describer.phrase(found, len(names), kind)
+
+    def in_short(self, asked: Asked) -> list[str]:
+        """Return the conditions as imperatives, for a dialogue. Raise UndescribableError."""
+        return [
+            imperative_of(self._clause([condition], asked.members, bare=False), self.book, self.voice)
+            for condition in asked.conditions
+            if not _is_implied(condition, asked)
+        ]
+
+
+def _is_implied(condition: Condition, asked: Asked) -> bool:
+    """True for *none of the books on the sofa* if the same books are to be elsewhere."""
+    return condition.quantity is Quantity.NONE and any(
+        other.things == condition.things and other.quantity is Quantity.ALL and other.predicate in PLACED
+        for other in asked.conditions
+    )
+
+
+def _lowered(sentence: str, names: Container[str]) -> str:
+    """Return the sentence with a small first letter, unless its first word is a name or *I*."""
+    first = sentence.partition(" ")[0]
+    if first in names or first.partition("'")[0] in ("I", "TV", "TVs"):
+        return sentence
+    return f"{sentence[:1].lower()}{sentence[1:]}"
