@@ -23,11 +23,12 @@ from embomatrix.world.task import Task
 
 
 class RefusalReason(StrEnum):
-    """Reasons in the order of the checks: three for drafts, ten for bindings, the rest for admission."""
+    """Reasons in the order of the checks: three for drafts, eleven for bindings, the rest for admission."""
 
     NO_ANSWER = "no_answer"
     UNUSABLE_ANSWER = "unusable_answer"
     UNFAITHFUL = "unfaithful"
+    UNPARSABLE = "unparsable"
     UNKNOWN_TYPE = "unknown_type"
     SUBSTANCE = "substance"
     INEXPRESSIBLE = "inexpressible"

@@ -166,15 +166,15 @@ def test_eai_task_is_bound_to_its_own_scene(eai: Path, flat: Scene, home: Scene)
     assert isinstance(imported, ImportedTask)
     assert imported.scene.base == "Rs_int"
     assert imported.task.instruction == "Put the toys on the dusted table."
-    outcome = outcome_of(item, imported)
+    outcome = outcome_of(item, imported, ["Rs_int"])
     assert outcome.unreachable == {"paper": ("(not (dusty table.n.02_1))",), "household": ()}
     assert "plaything.n.01 is read as toy_figure.n.01" in outcome.notes
 
 
 def test_report_counts_refusals_and_lists_unreachable_goals(eai: Path, flat: Scene) -> None:
     (item,) = read_eai(eai)
-    bound = outcome_of(item, bind_first(item, [flat], options=EVALUABLE))
-    refused = outcome_of(item, TaskRefusal(RefusalReason.DOES_NOT_FIT, "no room"))
+    bound = outcome_of(item, bind_first(item, [flat], options=EVALUABLE), ["Rs_int"])
+    refused = outcome_of(item, TaskRefusal(RefusalReason.DOES_NOT_FIT, "no room"), ["Rs_int"])
     summary = report_to_json([bound, refused])
     assert (summary["problems"], summary["bound"], summary["refused"]) == (2, 1, {"does_not_fit": 1})
     text = report_to_markdown([bound, refused])

@@ -25,18 +25,21 @@ from embomatrix.factory.pipeline.build import BuildSummary, build_dataset, split
 from embomatrix.factory.pipeline.cluster import admitted_by
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import BuildStore, VariantResult, VariantYield
+from embomatrix.factory.pipeline.variants import MAX_ABOUT_A_THING, MAX_EQUAL_SIGNATURES, DraftCrowd
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.writer.tasks import is_heldout_signature
+from embomatrix.factory.writer.tasks import Draft, is_heldout_signature
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_from_json
-from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.bddl import parse_formula
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.intent import IntentClause
 from embomatrix.world.scene import Room, Scene
-from embomatrix.world.task import TaskCategory
+from embomatrix.world.task import Task, TaskCategory
 
 TASKS_DIGEST = "d69bf6465a116ada798c3d1f19ed777f6bcdc33673436f0b2543856bed42fe41"
 """SHA-256 of the task records of `SETTINGS` without the digests of their bundles."""
@@ -395,3 +398,53 @@ def test_cluster_check_keeps_solved_tasks_and_reports_the_reward_of_others(
     results[tasks[0]] = result(tasks[0], InfraFailure(InfraCode.WORKER_LOST, "gone"))
     with pytest.raises(DatasetError, match="could not execute"):
         admitted_by(made, results)
+
+
+def test_build_without_held_out_tasks_reserves_nothing(tmp_path: Path) -> None:
+    settings = BuildSettings(train=12, heldout=0, seed=4, scenes=("Rs_int",), **QUICK)
+    rooms = build_dataset(tmp_path, settings).rooms
+    assert rooms["heldout"] == {"Rs_int": ()}
+    assert set(rooms["train"]["Rs_int"]) == {room.name for room in build_base_scene("Rs_int").rooms}
+    signatures = [record.signature for record in Dataset.load(tmp_path).records]
+    assert any(is_heldout_signature(signature, settings.seed) for signature in signatures)
+
+
+def test_variant_has_few_tasks_alike(dataset: Dataset) -> None:
+    of_variant: dict[str, list[TaskRecord]] = {}
+    for record in dataset.records:
+        of_variant.setdefault(record.task.scene_id, []).append(record)
+    for records in of_variant.values():
+        assert len({record.task.goal for record in records}) == len(records)
+        assert max(Counter(record.signature for record in records).values()) <= MAX_EQUAL_SIGNATURES
+        things = Counter(things for r in records for things in {clause.things for clause in r.intent})
+        assert max(things.values()) <= MAX_ABOUT_A_THING
+
+
+def test_fourth_wish_about_one_thing_is_no_new_task() -> None:
+    crowd = DraftCrowd()
+    goals = ["(cooked pizza_1)", "(hot pizza_1)", "(frozen pizza_1)", "(inside pizza_1 oven_1)"]
+    drafts = [_draft(goal, f"sign_{number}") for number, goal in enumerate(goals)]
+    for draft in drafts[:3]:
+        assert crowd.has_place(draft)
+        crowd.add(draft)
+    assert not crowd.has_place(drafts[3])
+    assert crowd.has_place(_draft("(open oven_1)", "open(oven)", thing="oven_1"))
+
+
+def test_equal_goal_in_other_words_is_no_new_task() -> None:
+    crowd = DraftCrowd()
+    crowd.add(_draft("(open oven_1)", "open(oven)"))
+    assert not crowd.has_place(_draft("(open oven_1)", "open(oven) ", thing="other"))
+
+
+def _draft(goal: str, signature: str, thing: str = "pizza_1") -> Draft:
+    task = Task(
+        "t",
+        "s",
+        "Words.",
+        TaskCategory.COMPOUND,
+        parse_formula(goal, {"pizza_1": "", "oven_1": ""}),
+        goal,
+        (thing,),
+    )
+    return Draft(task, (thing,), (), signature, (IntentClause("hot", (thing,)),))

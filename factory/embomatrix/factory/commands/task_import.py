@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +20,7 @@ from embomatrix.factory.task_import.importer import Depth, ImportSettings, impor
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     ProblemOutcome,
+    changed_problems,
     evaluation_of,
     outcome_from_json,
     report_to_json,
@@ -35,7 +36,7 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.world.bddl import BddlError
+from embomatrix.world.bddl import BddlError, BddlProblem
 from embomatrix.world.dataset import TASKS_FILE, DatasetError, write_dataset
 from embomatrix.world.substances import is_substance
 from embomatrix.world.task import Profile
@@ -120,7 +121,8 @@ def import_(
 
 def _written(out: Path, made: Sequence[Imported]) -> bool:
     """Write the admitted tasks as a dataset. Return False if there are none."""
-    verified = [item for item in made if isinstance(item, Verified)]
+    # a problem that is given twice makes one task
+    verified = list({item.record.task.task_id: item for item in made if isinstance(item, Verified)}.values())
     if verified:
         bundles = {item.record.bundle_digest: item.bundle for item in verified}
         write_dataset(out, [item.record for item in verified], bundles)
@@ -153,7 +155,9 @@ def _selected(
     """Return the problems that pass the filters. Raise ProblemSourceError if none does."""
     chosen = sources
     if profile is not None:
-        chosen = [source for source in chosen if not unreachable_atoms(read_problem(source)[0], profile)]
+        chosen = [
+            source for source in chosen if _passes(source, lambda read: not unreachable_atoms(read, profile))
+        ]
         if not chosen:
             raise ProblemSourceError(
                 f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
@@ -162,11 +166,19 @@ def _selected(
         chosen = [
             source
             for source in chosen
-            if not any(map(is_substance, read_problem(source)[0].objects.values()))
+            if _passes(source, lambda read: not any(map(is_substance, read.objects.values())))
         ]
         if not chosen:
             raise ProblemSourceError("each of the problems names a liquid or a powder: leave out --solids")
     return chosen
+
+
+def _passes(source: SourceText, condition: Callable[[BddlProblem], bool]) -> bool:
+    """True if the problem meets the condition, or can't be parsed: then the import refuses it with the reason."""
+    try:
+        return condition(read_problem(source)[0])
+    except BddlError:
+        return True
 
 
 def _write(
@@ -196,13 +208,13 @@ def _check_free(out: Path, depth: Depth, outcomes: Path | None) -> None:
 
 
 def _sources(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> list[SourceText]:
-    """Return the given problems. Raise ProblemSourceError for invalid BDDL, before any scene is built."""
+    """Return the given problems. Raise ProblemSourceError if a single one is invalid BDDL; many are refused one by one."""
     sources = list(_given(bddl, activity, jsonl, eai))
-    for source in sources:
+    if len(sources) == 1:
         try:
-            read_problem(source)
+            read_problem(sources[0])
         except BddlError as error:
-            raise ProblemSourceError(f"{source.name}: {error}") from error
+            raise ProblemSourceError(f"{sources[0].name}: {error}") from error
     return sources
 
 
@@ -265,3 +277,9 @@ def _print_outcomes(outcomes: Sequence[ProblemOutcome], depth: Depth) -> None:
     done = "verified" if depth is Depth.VERIFY else "imported"
     counts = Counter(f"refused: {each.reason}" if each.reason else done for each in outcomes)
     show_table(("outcome", "problems"), counts.most_common())
+    right = [each for each in outcomes if each.has_right_scene]
+    changed = ", ".join(f"{count} {change}" for change, count in changed_problems(outcomes)) or "none"
+    say(
+        f"bound without any change: {sum(each.is_faithful for each in right)} of {len(right)} with a right scene; "
+        f"changes: {changed}"
+    )

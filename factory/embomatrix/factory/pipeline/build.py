@@ -121,10 +121,17 @@ def _check_rooms(settings: BuildSettings) -> None:
         )
 
 
-def _all_held_out(scenes: Sequence[Scene]) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return all rooms as held-out rooms, for a build without training tasks."""
+def _rooms_by_split(
+    scenes: Sequence[Scene], settings: BuildSettings
+) -> dict[str, dict[str, tuple[str, ...]]]:
+    """Return the rooms of both splits. A build of one split has all rooms for it."""
     everything = {scene.base: tuple(room.name for room in scene.rooms) for scene in scenes}
-    return {"train": dict.fromkeys(everything, ()), "heldout": everything}
+    nothing: dict[str, tuple[str, ...]] = dict.fromkeys(everything, ())
+    if not settings.train:
+        return {"train": nothing, "heldout": everything}
+    if not settings.heldout:
+        return {"train": everything, "heldout": nothing}
+    return split_rooms(scenes, settings.seed)
 
 
 def build_dataset(
@@ -149,7 +156,7 @@ def build_dataset(
     began = time.process_time()
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     store.spend({"base_scenes": len(bases)}, time.process_time() - began)
-    rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)
+    rooms = _rooms_by_split(bases, settings)
     died = DatasetError(
         "a process that makes scene variants died, possibly for lack of memory: finished variants are kept; run the "
         "same command again with fewer --jobs"

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import time
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -41,6 +42,7 @@ from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.syntax import Plan
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.goal import Formula
 from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
@@ -51,6 +53,10 @@ MAX_DRAFTS: Final = 14
 """Number of drafts per variant. Some are not admitted."""
 WRITE_TRIES: Final = 120
 """Maximum number of tasks written for the drafts. Tasks with signatures of the other split are discarded."""
+MAX_EQUAL_SIGNATURES: Final = 2
+"""Maximum number of drafts of a variant with one goal signature."""
+MAX_ABOUT_A_THING: Final = 3
+"""Maximum number of drafts of a variant that demand something of the same thing. Kitchens may hold a single food."""
 FOCUS_ROOMS: Final = 3
 """Number of rooms that get small objects and that the variant's tasks are about."""
 
@@ -126,6 +132,28 @@ def _focus(
     return tuple(order[:FOCUS_ROOMS])
 
 
+class DraftCrowd:
+    """Drafts of one variant, which limit near-duplicates by goal, whatever the words."""
+
+    def __init__(self) -> None:
+        self._goals: set[Formula] = set()
+        self._signatures = Counter[str]()
+        self._things = Counter[tuple[str, ...]]()
+
+    def has_place(self, draft: Draft) -> bool:
+        """True if no draft has the same goal, and few have its signature or demand something of the same thing."""
+        return (
+            draft.task.goal not in self._goals
+            and self._signatures[draft.signature] < MAX_EQUAL_SIGNATURES
+            and all(self._things[clause.things] < MAX_ABOUT_A_THING for clause in draft.intent)
+        )
+
+    def add(self, draft: Draft) -> None:
+        self._goals.add(draft.task.goal)
+        self._signatures[draft.signature] += 1
+        self._things.update({clause.things for clause in draft.intent})
+
+
 class _VariantWork:
     """Writing and judging of one variant's tasks."""
 
@@ -134,6 +162,7 @@ class _VariantWork:
         self._order = order
         self._maker = maker
         self._known = set(order.known)
+        self._crowd = DraftCrowd()
         self._admitted: list[tuple[Draft, Plan]] = []
         self._rejections: list[Rejection] = []
 
@@ -181,6 +210,7 @@ class _VariantWork:
                     named = replace(draft.task, task_id=self._task_id(len(drafts)))
                     drafts.append(replace(draft, task=named))
                     self._known.add(uniqueness_key(draft.signature, draft.task.instruction))
+                    self._crowd.add(draft)
         return drafts
 
     def _written(
@@ -224,12 +254,16 @@ class _VariantWork:
         }
 
     def _is_new(self, draft: Draft) -> bool:
-        """True if the signature belongs to this split and the task is not known yet."""
+        """True if the signature belongs to this split, and the task is neither known nor like many others."""
         key = uniqueness_key(draft.signature, draft.task.instruction)
-        in_split = is_heldout_signature(draft.signature, self._maker.settings.seed) is (
-            self._order.split == "heldout"
-        )
-        return in_split and key not in self._known
+        return self._is_in_split(draft.signature) and key not in self._known and self._crowd.has_place(draft)
+
+    def _is_in_split(self, signature: str) -> bool:
+        """True if the signature belongs to this split. Without held-out tasks, training has all signatures."""
+        settings = self._maker.settings
+        if not settings.heldout:
+            return True
+        return is_heldout_signature(signature, settings.seed) is (self._order.split == "heldout")
 
     def _judge(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> bool:
         verdict = self._verdict(simulator, physics, draft)

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
@@ -11,6 +12,7 @@ from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.neighbours import neighbours_of
+from embomatrix.factory.task_import.scene_changes import SceneChange, lacking, stock_of
 from embomatrix.factory.task_import.size_requirements import requirements_of
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI, SourceText
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
@@ -50,6 +52,8 @@ SEED_STRIDE: Final = 1_000_003
 """Distance between the seeds of two draws. No other import uses such a seed."""
 MAX_MISFITS: Final = 12
 """Maximum number of scenes per round in which the objects find no place. Laying out forty objects takes seconds."""
+MAX_CHANGED: Final = 4
+"""Maximum number of imports with changes that are made in search of one without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,8 @@ class Verified:
     bundle: bytes
     notes: tuple[str, ...] = ()
     """Notes of the import."""
+    changes: tuple[SceneChange, ...] = ()
+    """Changes that make the binding unfaithful."""
 
 
 Imported = ImportedTask | Verified | TaskRefusal
@@ -69,9 +75,9 @@ Imported = ImportedTask | Verified | TaskRefusal
 def bind_first(
     source: SourceText, bases: Sequence[Scene], *, seed: int = 0, options: ImportOptions | None = None
 ) -> ImportedTask | TaskRefusal:
-    """Bind the problem to the first suitable scene. Otherwise return the refusal that came furthest. Raise BddlError.
+    """Bind the problem with as few changes as possible. Otherwise return the refusal that came furthest. Raise BddlError.
 
-    The problem's own scene comes first, then scenes with all furniture, then scenes that lack some.
+    `imports` gives the order of the scenes.
     """
     return _first(imports(source, bases, seed=seed, options=options or ImportOptions()))
 
@@ -79,37 +85,62 @@ def bind_first(
 def imports(
     source: SourceText, bases: Sequence[Scene], *, seed: int, options: ImportOptions, draws: int = 1
 ) -> Iterator[ImportedTask | TaskRefusal]:
-    """Yield imports of the problem into each unchanged scene, and with missing furniture added if the options allow it.
+    """Yield imports of the problem into one scene after another, those with few changes first.
 
-    The problem's own scene is tried ``draws`` times before all others. The last round renumbers rooms. Refusals that
-    do not depend on the scene end the search.
+    The problem's own scene is tried ``draws`` times before all others, also with missing furniture added if the
+    options allow it. Then come unchanged imports into the others, imports that only change objects, and imports with
+    added furniture, into the scenes that lack least first. Refusals that do not depend on the scene end the search.
     """
     own = [base for base in bases if base.base == source.scene]
-    others = [base for base in bases if base.base != source.scene]
-    as_it_is = replace(options, furnishing=False)
+    others = _by_lack(source, [base for base in bases if base.base != source.scene])
+    bare = replace(options, furnishing=False)
     for draw, base in itertools.product(range(draws), own):
         drawn = seed + draw * SEED_STRIDE
-        outcome = import_problem(source, base, seed=drawn, options=as_it_is)
+        outcome = import_problem(source, base, seed=drawn, options=bare)
         yield outcome
         if isinstance(outcome, TaskRefusal) and outcome.reason in SCENE_INDEPENDENT:
             return
         if isinstance(outcome, TaskRefusal) and options.furnishing:
             yield import_problem(source, base, seed=drawn, options=options)
-    rounds = [(as_it_is, others)]
-    if options.furnishing:
-        rounds += [(options, others), (replace(options, renumbering=True), [*own, *others])]
-    for tried, scenes in rounds:
-        misfits = 0
-        for base in scenes:
-            outcome = import_problem(source, base, seed=seed, options=tried)
-            yield outcome
-            if not isinstance(outcome, TaskRefusal):
+    changed: list[ImportedTask] = []
+    for tried, scenes in ((bare, others), (replace(bare, renumbering=True), [*own, *others])):
+        for outcome in _round(source, scenes, seed, tried):
+            if isinstance(outcome, ImportedTask) and outcome.changes:
+                changed.append(outcome)
+                if len(changed) >= MAX_CHANGED:
+                    break
                 continue
-            if outcome.reason in SCENE_INDEPENDENT:
+            yield outcome
+            if isinstance(outcome, TaskRefusal) and outcome.reason in SCENE_INDEPENDENT:
                 return
-            misfits += outcome.reason is RefusalReason.DOES_NOT_FIT
-            if misfits == MAX_MISFITS:
-                break
+    yield from sorted(changed, key=lambda imported: len(imported.changes))
+    if options.furnishing:
+        yield from _round(source, others, seed, options)
+        yield from _round(source, [*own, *others], seed, replace(options, renumbering=True))
+
+
+def _by_lack(source: SourceText, bases: Sequence[Scene]) -> list[Scene]:
+    """Return the scenes that the problem names first, then those with its rooms, then those that lack least furniture."""
+    problem, _ = read_problem(source)
+
+    def order(base: Scene) -> tuple[bool, float]:
+        lack = lacking(problem, stock_of(base))
+        return base.base not in source.named_scenes, math.inf if lack is None else lack
+
+    return sorted(bases, key=order)
+
+
+def _round(
+    source: SourceText, scenes: Sequence[Scene], seed: int, options: ImportOptions
+) -> Iterator[ImportedTask | TaskRefusal]:
+    """Yield the import into each scene, until the objects have found no place in several."""
+    misfits = 0
+    for base in scenes:
+        outcome = import_problem(source, base, seed=seed, options=options)
+        yield outcome
+        misfits += isinstance(outcome, TaskRefusal) and outcome.reason is RefusalReason.DOES_NOT_FIT
+        if misfits == MAX_MISFITS:
+            return
 
 
 def verify_first(
@@ -190,7 +221,7 @@ def verify(
         rooms=imported.rooms,
         signature=imported.signature,
     )
-    return Verified(record, data, imported.notes)
+    return Verified(record, data, imported.notes, imported.changes)
 
 
 def poses_for(

@@ -43,6 +43,11 @@ class Addition:
     beside: tuple[str, ...] = ()
     needs: frozenset[str] = frozenset()
 
+    @property
+    def is_missing_furniture(self) -> bool:
+        """True if the start says no more than its room. If it is furniture, the scene was expected to have it."""
+        return self.relation is None and not self.beside
+
 
 @dataclass(frozen=True, slots=True)
 class Binding:
@@ -75,20 +80,26 @@ def bind(
     inroom = dict(problem.initial_pairs(Relation.INROOM))
     placed = _placements(problem)
     view = SceneView(scene)
-    fixtures = [
-        name
-        for name in inroom
-        if problem.objects[name] not in FLOORS
-        and problem.objects[name] != AGENT
-        and name not in placed
-        and name not in problem.wildcards
-    ]
+    fixtures = fixtures_of(problem)
     rooms, found = search(problem, view, inroom, fixtures, rng, options, excluded)
     problem = _with_wildcards_expanded(problem, view, rooms, found)
     floors = {name: rooms[room] for name, room in inroom.items() if problem.objects.get(name) in FLOORS}
     unassigned = {name: rooms[inroom[name]] for name in fixtures if name not in found}
     additions = _in_order(problem, placed, found, floors, unassigned)
     return Binding(problem, found, floors, additions, rooms, _robot_room(problem, placed, floors, scene))
+
+
+def fixtures_of(problem: BddlProblem) -> list[str]:
+    """Return the objects that ``:init`` places only by naming their room, without floors, agents and wildcards."""
+    placed = _placements(problem)
+    return [
+        name
+        for name, _ in problem.initial_pairs(Relation.INROOM)
+        if problem.objects[name] not in FLOORS
+        and problem.objects[name] != AGENT
+        and name not in placed
+        and name not in problem.wildcards
+    ]
 
 
 def _with_wildcards_expanded(

@@ -5,15 +5,17 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
 
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Imported, bind_first, verify_first
-from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of
+from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of, unparsable_outcome
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
+from embomatrix.world.bddl import BddlError
 
 ImportOutcome = tuple[ProblemOutcome, Imported | None]
 """Outcome of a problem, for the report and as a value. Bound tasks stay in the process that made them."""
@@ -49,17 +51,23 @@ class ProblemImporter:
         self._library = PlacementLibrary()
 
     def run(self, source: SourceText) -> ImportOutcome:
-        """Import one problem. Raise BddlError."""
+        """Import one problem. Text that is no BDDL is refused, so that the other problems are imported."""
+        try:
+            item = self._imported(source)
+        except BddlError as error:
+            refusal = TaskRefusal(RefusalReason.UNPARSABLE, str(error))
+            return unparsable_outcome(source, refusal.sentence), refusal
+        return outcome_of(source, item, self._settings.scenes), item
+
+    def _imported(self, source: SourceText) -> Imported:
         seed = self._settings.seed
-        item: Imported
         match self._settings.depth:
             case Depth.INSTANTIATE:
-                item = bind_first(source, self._bases, seed=seed, options=ImportOptions(reachable=False))
+                return bind_first(source, self._bases, seed=seed, options=ImportOptions(reachable=False))
             case Depth.BIND:
-                item = bind_first(source, self._bases, seed=seed)
+                return bind_first(source, self._bases, seed=seed)
             case Depth.VERIFY:
-                item = verify_first(source, self._bases, self._library, self._foresight, seed=seed)
-        return outcome_of(source, item), item
+                return verify_first(source, self._bases, self._library, self._foresight, seed=seed)
 
     def close(self) -> None:
         self._library.close()

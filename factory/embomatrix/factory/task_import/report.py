@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from embomatrix.factory.admission import TaskRefusal
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.factory.task_import.batch import Imported, Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms
+from embomatrix.factory.task_import.scene_changes import SceneChange, find_right_scene
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI, SourceText
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.task import Profile
@@ -23,6 +24,7 @@ FIGURES: Final[Mapping[str, tuple[str, float]]] = {
 }
 """Name and target of the figure for each source."""
 SOLVED_GOAL: Final = 0.95
+FAITHFUL_GOAL: Final = 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +34,8 @@ class ProblemOutcome:
     ``scene`` is its base scene; if the problem is refused, ``reason`` and ``sentence`` are set instead.
 
     ``unreachable`` lists the goal's literals that no skill achieves, by profile. ``notes`` lists changes made to the
-    problem.
+    problem. ``changes`` makes the binding unfaithful, one entry for each piece, object or room. ``has_right_scene`` says that
+    one of the scenes has all rooms and furniture of the problem.
     """
 
     name: str
@@ -42,28 +45,58 @@ class ProblemOutcome:
     sentence: str
     unreachable: Mapping[str, tuple[str, ...]]
     notes: tuple[str, ...]
+    changes: tuple[SceneChange, ...] = ()
+    has_right_scene: bool = False
 
     @property
     def is_bound(self) -> bool:
         return not self.reason
 
+    @property
+    def is_faithful(self) -> bool:
+        """True if the problem is bound, and nothing but its own objects was added."""
+        return self.is_bound and not self.changes
+
+    def is_reached_by(self, profile: Profile) -> bool:
+        """True if a skill of the profile achieves each literal of the goal."""
+        return self.reason != RefusalReason.UNPARSABLE and not self.unreachable[profile.value]
+
 
 def outcome_from_json(value: dict[str, Any]) -> ProblemOutcome:
     """Decode an outcome from JSON. Raise KeyError or TypeError."""
     unreachable = {profile: tuple(atoms) for profile, atoms in value["unreachable"].items()}
-    return ProblemOutcome(**{**value, "unreachable": unreachable, "notes": tuple(value["notes"])})
+    changes = tuple(map(SceneChange, value["changes"]))
+    return ProblemOutcome(
+        **{**value, "unreachable": unreachable, "notes": tuple(value["notes"]), "changes": changes}
+    )
 
 
-def outcome_of(source: SourceText, imported: Imported) -> ProblemOutcome:
-    """Return the outcome of a problem for the report. Raise BddlError."""
+def outcome_of(source: SourceText, imported: Imported, scenes: Sequence[str]) -> ProblemOutcome:
+    """Return the outcome of a problem that was imported into one of the scenes. Raise BddlError."""
     problem, notes = read_problem(source)
     unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
+    has_right_scene = find_right_scene(source, problem, scenes) is not None
     if isinstance(imported, TaskRefusal):
-        scene, reason, sentence = "", imported.reason.value, imported.sentence
-    else:
-        task = imported.record.task if isinstance(imported, Verified) else imported.task
-        scene, reason, sentence, notes = base_scene_of(task.scene_id), "", "", imported.notes
-    return ProblemOutcome(source.name, source.source, scene, reason, sentence, unreachable, notes)
+        return ProblemOutcome(
+            source.name,
+            source.source,
+            "",
+            imported.reason.value,
+            imported.sentence,
+            unreachable,
+            notes,
+            has_right_scene=has_right_scene,
+        )
+    task = imported.record.task if isinstance(imported, Verified) else imported.task
+    scene, changes = base_scene_of(task.scene_id), imported.changes
+    return ProblemOutcome(
+        source.name, source.source, scene, "", "", unreachable, imported.notes, changes, has_right_scene
+    )
+
+
+def unparsable_outcome(source: SourceText, sentence: str) -> ProblemOutcome:
+    """Return the outcome of a text that is no BDDL."""
+    return ProblemOutcome(source.name, source.source, "", RefusalReason.UNPARSABLE, sentence, {}, ())
 
 
 def report_to_json(outcomes: Sequence[ProblemOutcome]) -> dict[str, Any]:
@@ -72,8 +105,17 @@ def report_to_json(outcomes: Sequence[ProblemOutcome]) -> dict[str, Any]:
         "problems": len(outcomes),
         "bound": sum(outcome.is_bound for outcome in outcomes),
         "refused": dict(Counter(outcome.reason for outcome in outcomes if outcome.reason).most_common()),
+        "faithful": sum(outcome.is_faithful for outcome in outcomes),
+        "right_scene": sum(outcome.has_right_scene for outcome in outcomes),
+        "faithful_with_right_scene": sum(each.is_faithful and each.has_right_scene for each in outcomes),
+        "changed": dict(changed_problems(outcomes)),
         "outcomes": [dataclasses.asdict(outcome) for outcome in outcomes],
     }
+
+
+def changed_problems(outcomes: Sequence[ProblemOutcome]) -> list[tuple[SceneChange, int]]:
+    """Return the number of bound problems with each kind of change, the commonest first."""
+    return Counter(change for each in outcomes for change in set(each.changes)).most_common()
 
 
 def report_to_markdown(outcomes: Sequence[ProblemOutcome]) -> str:
@@ -87,8 +129,9 @@ def report_to_markdown(outcomes: Sequence[ProblemOutcome]) -> str:
         lines += ["", "## Refused", ""]
         lines += [f"* `{each.name}` ({each.reason}): {each.sentence}" for each in outcomes if each.reason]
         lines += [""]
+    lines += _faithfulness(outcomes)
     for profile in Profile:
-        short = [outcome for outcome in outcomes if outcome.unreachable[profile.value]]
+        short = [each for each in outcomes if each.unreachable.get(profile.value)]
         lines += [
             f"## Goals that the profile `{profile.value}` does not reach: {len(short)}",
             "",
@@ -104,6 +147,25 @@ def report_to_markdown(outcomes: Sequence[ProblemOutcome]) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
+def _faithfulness(outcomes: Sequence[ProblemOutcome]) -> list[str]:
+    """Return a section about faithful bindings and about changes."""
+    right = [each for each in outcomes if each.has_right_scene]
+    faithful = sum(each.is_faithful for each in outcomes)
+    lines = [
+        f"## Faithful bindings: {faithful}",
+        "",
+        f"{len(right)} problems have a scene with all their rooms and furniture; "
+        f"{sum(each.is_faithful for each in right)} of these are bound without any change.",
+        "",
+    ]
+    changed = changed_problems(outcomes)
+    if changed:
+        lines += ["| change | problems |", "| --- | ---: |"]
+        lines += [f"| {change} | {count} |" for change, count in changed]
+        lines += [""]
+    return lines
+
+
 def evaluation_of(outcomes: Sequence[ProblemOutcome], seed: int) -> EvaluationFigures:
     """Return import rates by source, and the share of goals that each profile reaches."""
     figures: list[Figure] = []
@@ -114,9 +176,22 @@ def evaluation_of(outcomes: Sequence[ProblemOutcome], seed: int) -> EvaluationFi
         n = len(selected)
         figures.append(Figure(name, sum(each.is_bound for each in selected) / n, "", Better.HIGHER, n, goal))
         for profile in Profile:
-            reached = sum(not each.unreachable[profile.value] for each in selected)
+            reached = sum(each.is_reached_by(profile) for each in selected)
             figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", Better.NEITHER, n))
+        figures += _faithful_shares(selected, name)
     return EvaluationFigures("imports", {"seed": seed}, tuple(figures))
+
+
+def _faithful_shares(outcomes: Sequence[ProblemOutcome], name: str) -> list[Figure]:
+    """Return the share of problems bound without changes: of those with a right scene, and of all."""
+    right = [each for each in outcomes if each.has_right_scene]
+    title = name.replace("import_rate", "faithful_share")
+    figures = []
+    for selected, words, goal in ((right, "", FAITHFUL_GOAL), (outcomes, " of all", None)):
+        if selected:
+            share = sum(each.is_faithful for each in selected) / len(selected)
+            figures.append(Figure(f"{title}{words}", share, "", Better.HIGHER, len(selected), goal))
+    return figures
 
 
 def solved_of(outcomes: Sequence[ProblemOutcome], seed: int, *, solids: bool = False) -> EvaluationFigures:
@@ -128,9 +203,7 @@ def solved_of(outcomes: Sequence[ProblemOutcome], seed: int, *, solids: bool = F
     figures: list[Figure] = []
     for source, (name, _) in FIGURES.items():
         for profile in Profile:
-            selected = [
-                each for each in outcomes if each.source == source and not each.unreachable[profile.value]
-            ]
+            selected = [each for each in outcomes if each.source == source and each.is_reached_by(profile)]
             if selected:
                 title = (
                     f"{name.replace('import_rate', 'oracle_solved')} of what {profile.value} reaches{without}"

@@ -1,5 +1,6 @@
 """Search for a problem's furniture in a scene, by backtracking over rooms and objects."""
 
+import functools
 import itertools
 import math
 from collections import defaultdict
@@ -101,10 +102,15 @@ def _rooms_for(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
 
 
 def _renumbered(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
-    stem = word.rpartition("_")[0] if is_room_instance(word) else word
+    stem = room_type_of(word)
     if not any(room.type == stem for room in scene.rooms):
         stem = SIMILAR_ROOMS.get(stem, stem)
     return sorted(_rooms_for(scene, stem, rng), key=lambda name: name == word)
+
+
+def room_type_of(word: str) -> str:
+    """Return the room type of a room name: ``kitchen`` for ``kitchen_0`` and for ``kitchen``."""
+    return word.rpartition("_")[0] if is_room_instance(word) else word
 
 
 def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterator[dict[str, str]]:
@@ -157,7 +163,7 @@ def _domains(
             if contents:
                 order.sort(key=lambda other: room_for(view.asset(other), contents))
             domains[name] = order
-        elif not any(_liftable(category) for category in categories):
+        elif not type_is_liftable(problem.objects[name]):
             missing.append(name)
     return domains, missing
 
@@ -225,6 +231,14 @@ def _backtrack(
 def has_abilities(asset: Asset, needs: Iterable[str]) -> bool:
     """True if the asset has all abilities. A container has a cavity."""
     return all(bool(asset.interiors) if need == "container" else asset.can(need) for need in needs)
+
+
+@functools.cache
+def type_is_liftable(type_name: str) -> bool:
+    """True if a model of the type is small and light enough for the robot. An import adds such objects."""
+    catalog = Catalog.load()
+    categories = catalog.categories_of(type_name) if catalog.has_synset(type_name) else ()
+    return any(_liftable(category) for category in categories)
 
 
 def _liftable(category: str) -> bool:

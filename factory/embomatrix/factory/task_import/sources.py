@@ -49,7 +49,8 @@ class ProblemSourceError(ValueError):
 class SourceText:
     """Text of one problem. ``request`` is the instruction; if it is empty, the problem's name is the instruction.
 
-    ``scene`` is the base scene that the problem was written for; empty means any scene.
+    ``scene`` is the base scene that the problem was written for; empty means any scene. ``scenes`` lists those that
+    its author finds suitable.
     """
 
     name: str
@@ -57,6 +58,12 @@ class SourceText:
     source: str
     request: str = ""
     scene: str = ""
+    scenes: tuple[str, ...] = ()
+
+    @property
+    def named_scenes(self) -> tuple[str, ...]:
+        """Base scenes that the problem's author names; empty means any scene."""
+        return (self.scene,) if self.scene else self.scenes
 
     @property
     def is_held_out(self) -> bool:
@@ -85,7 +92,7 @@ def read_file(path: Path) -> SourceText:
 
 
 def read_jsonl(path: Path) -> Iterator[SourceText]:
-    """Yield the problems of a JSON lines file with the fields ``name`` and ``bddl``.
+    """Yield the problems of a JSON lines file with the fields ``name`` and ``bddl``, and optional ``scenes``.
 
     Raise ProblemSourceError that names the line.
     """
@@ -95,9 +102,10 @@ def read_jsonl(path: Path) -> Iterator[SourceText]:
         try:
             record = parse_json(line)
             name, text = record["name"], record["bddl"]
+            scenes = tuple(map(str, record.get("scenes", ())))
         except (ValueError, KeyError, TypeError) as error:
             raise ProblemSourceError(f"{path}:{number}: expected an object with 'name' and 'bddl'") from error
-        yield SourceText(str(name), str(text), "embomatrix")
+        yield SourceText(str(name), str(text), "embomatrix", scenes=scenes)
 
 
 def read_eai(folder: Path) -> tuple[SourceText, ...]:

@@ -24,6 +24,7 @@ from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.models import models_for, with_sizes
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
+from embomatrix.factory.task_import.scene_changes import SceneChange, changes_of
 from embomatrix.factory.task_import.search import BindingOptions
 from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of
 from embomatrix.factory.task_import.sources import SourceText
@@ -74,6 +75,8 @@ class ImportedTask:
     """The problem's own names of the same objects."""
     notes: tuple[str, ...] = ()
     """Changes made to the problem, and furniture added to the scene."""
+    changes: tuple[SceneChange, ...] = ()
+    """Changes that make the binding unfaithful, one for each piece, object or room."""
     is_held_out: bool = False
     """True if the task is used for evaluation only."""
 
@@ -289,7 +292,7 @@ class _Binder:
         task = Task(
             task_id=self._scene_id,
             scene_id=scene.scene_id,
-            instruction=instruction_of(self._source, self._problem),
+            instruction=instruction_of(self._source, self._problem, binding.rooms),
             category=category_of(goal),
             goal=goal,
             goal_bddl=render(goal),
@@ -301,14 +304,24 @@ class _Binder:
         rooms = tuple(sorted({view.room(name) for name in about}))
         notes = self._notes(view, names, binding)
         signature = signature_of(goal, view)
-        return ImportedTask(scene, task, start, tuple(names.values()), rooms, signature, tuple(names), notes)
+        return ImportedTask(
+            scene,
+            task,
+            start,
+            tuple(names.values()),
+            rooms,
+            signature,
+            tuple(names),
+            notes,
+            changes_of(self._source, self._base, binding, names, scene),
+        )
 
     def _notes(self, view: SceneView, names: Mapping[str, str], binding: Binding) -> tuple[str, ...]:
         """Return a sentence for each change to scene and problem."""
         added = tuple(
             f"{self._base.base} lacks {each.type}: {names[each.name]} was added to {view.room(names[each.name])}"
             for each in binding.additions
-            if view.item(names[each.name]).fixed
+            if each.is_missing_furniture and view.item(names[each.name]).fixed
         )
         moved = tuple(
             f"{word} is read as {room}"

@@ -3,6 +3,7 @@
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Final
 
 from embomatrix.factory.scenes.view import SceneView
@@ -25,13 +26,18 @@ _ROOM_OR_TEXT: Final = re.compile(
 )
 
 
-def instruction_of(source: SourceText, problem: BddlProblem) -> str:
-    """Return the instruction. The paper's tasks encode it in the problem's name, with underscores for spaces."""
+def instruction_of(
+    source: SourceText, problem: BddlProblem, rooms: Mapping[str, str] = MappingProxyType({})
+) -> str:
+    """Return the instruction. The paper's tasks encode it in the problem's name, with underscores for spaces.
+
+    ``rooms`` maps the problem's room names to the scene's, in the instruction too.
+    """
     words = source.request or problem.name
     words = re.sub(r"-\d+$", "", words)
     words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
     spaced = " ".join(
-        word if is_room_instance(word.lower()) else word.replace("_", " ")
+        rooms.get(word.lower(), word) if is_room_instance(word.lower()) else word.replace("_", " ")
         for word in _ROOM_OR_TEXT.findall(words)
     )
     words = re.sub(r"\s+([.,]|$)", r"\1", re.sub(r"\s+", " ", spaced)).strip(" .")
