@@ -5,9 +5,10 @@ from pathlib import Path
 from embomatrix.factory.commands.language_model import MODEL_ERRORS
 from embomatrix.factory.commands.options import processes
 from embomatrix.factory.commands.terminal import fail, progress, say, show_table, user_errors
+from embomatrix.factory.days.maker import DAYS
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_dataset
-from embomatrix.factory.pipeline.settings import BuildSettings
+from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.world.task import TaskCategory
 
@@ -21,6 +22,7 @@ def make_dataset(
     layout: LayoutAgents | None = None,
 ) -> None:
     """Build the dataset with progress bars, then print a summary. Exit if it has too few tasks."""
+    making = DAYS if settings.writer is WriterKind.SOCIAL else None
     kept = f": finished tasks are kept in {out}; run the same command again to resume"
     with user_errors(out, kept, MODEL_ERRORS), progress() as bars:
         tasks = {
@@ -35,6 +37,7 @@ def make_dataset(
             processes(jobs),
             check,
             layout,
+            making,
         )
     _print_summary(summary)
     say(f"dataset: {out}")

@@ -17,6 +17,7 @@ from embomatrix.factory.days.drafts import Combination, DraftWriter, combination
 from embomatrix.factory.days.laying import DayScene, lay_out
 from embomatrix.factory.faithfulness.shortcuts import find_shortcuts, shortcut_in_words
 from embomatrix.factory.language.kinds import is_held_out
+from embomatrix.factory.pipeline.build import Making
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.store import Rejection, VariantResult, VariantYield
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
@@ -103,6 +104,8 @@ class DayMaker:
         return draw_cast(order.base, order.rooms, rng, order.split, self._settings.seed)
 
 
+DAYS: Final = Making(DayMaker, whole_scenes=True)
+"""Making of days in whole scenes."""
 _NOTHING: Final = TaskRefusal(
     RefusalReason.NO_SCENE_OBJECT, "no event of the table suits the people and rooms of this place"
 )

@@ -10,7 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.settings import BuildSettings
@@ -18,6 +18,7 @@ from embomatrix.factory.pipeline.store import BuildStore, Rejection, VariantYiel
 from embomatrix.factory.pipeline.variants import TASKS_PER_VARIANT, VariantMaker, VariantOrder, uniqueness_key
 from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
 from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.household import place_of
 from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.sim.process_pool import shared_work
 from embomatrix.world.catalog import Catalog
@@ -121,8 +122,62 @@ def _check_rooms(settings: BuildSettings) -> None:
         )
 
 
+class Maker(Protocol):
+    """Maker of variants: small objects and tasks about them, or a day with its needs."""
+
+    def make(self, order: VariantOrder) -> VariantYield:
+        """Return the variant of an order. It depends only on the settings and the order."""
+        ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Making:
+    """Way in which variants are made. ``begin`` starts a maker from the settings, in each process of the build.
+
+    If ``whole_scenes``, the held-out tasks lie in scenes of their own, otherwise in rooms of their own.
+    """
+
+    begin: Callable[..., Maker]
+    whole_scenes: bool = False
+
+
+def _make(maker: Maker, order: VariantOrder) -> VariantYield:
+    return maker.make(order)
+
+
+HELD_OUT_SCENES: Final = 5
+"""One in this many scenes of a kind of place is held out, if the held-out tasks have scenes of their own."""
+
+
+def split_scenes(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple[str, ...]]]:
+    """Return all rooms of the held-out scenes, and all rooms of the others, by split and scene.
+
+    One in five scenes of each kind of place is held out, but at least one scene if there are two. A single scene is in both
+    splits: its held-out tasks differ in needs, words and goal shapes.
+    """
+    by_place: defaultdict[str, list[str]] = defaultdict(list)
+    for scene in scenes:
+        by_place[place_of(scene.base)].append(scene.base)
+    heldout = {
+        base
+        for names in by_place.values()
+        for rank, base in enumerate(sorted(names))
+        if rank % HELD_OUT_SCENES == seed % HELD_OUT_SCENES and len(names) >= HELD_OUT_SCENES
+    }
+    if not heldout and len(scenes) > 1:
+        heldout = {sorted(scene.base for scene in scenes)[seed % len(scenes)]}
+    both = len(scenes) == 1
+    rooms = {scene.base: tuple(room.name for room in scene.rooms) for scene in scenes}
+    return {
+        "train": {base: names if both or base not in heldout else () for base, names in rooms.items()},
+        "heldout": {base: names if both or base in heldout else () for base, names in rooms.items()},
+    }
+
+
 def _rooms_by_split(
-    scenes: Sequence[Scene], settings: BuildSettings
+    scenes: Sequence[Scene], settings: BuildSettings, *, whole_scenes: bool
 ) -> dict[str, dict[str, tuple[str, ...]]]:
     """Return the rooms of both splits. A build of one split has all rooms for it."""
     everything = {scene.base: tuple(room.name for room in scene.rooms) for scene in scenes}
@@ -131,7 +186,7 @@ def _rooms_by_split(
         return {"train": nothing, "heldout": everything}
     if not settings.heldout:
         return {"train": everything, "heldout": nothing}
-    return split_rooms(scenes, settings.seed)
+    return split_scenes(scenes, settings.seed) if whole_scenes else split_rooms(scenes, settings.seed)
 
 
 def build_dataset(
@@ -142,8 +197,11 @@ def build_dataset(
     jobs: int = 1,
     check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
+    making: Making | None = None,
 ) -> BuildSummary:
     """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted tasks.
+
+    ``making`` replaces the maker of variants.
 
     ``check`` is a second check of each variant, such as a cluster. ``writer`` and ``layout`` replace the writer of
     the settings and the rule-based layout agents; they run in this process. Otherwise ``jobs`` processes are used.
@@ -151,20 +209,21 @@ def build_dataset(
     Raise CatalogError for an unknown scene. Raise DatasetError if no room can be held out, if the folder holds a
     build with other settings, or if a process dies. Raise OSError if the folder can't be written.
     """
-    _check_rooms(settings)  # checked before anything is written, so that an error leaves no folder behind
+    whole_scenes = making is not None and making.whole_scenes
+    if not whole_scenes:
+        _check_rooms(settings)  # checked before anything is written, so that an error leaves no folder behind
     store = BuildStore(folder, dataclasses.asdict(settings))
     began = time.process_time()
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     store.spend({"base_scenes": len(bases)}, time.process_time() - began)
-    rooms = _rooms_by_split(bases, settings)
+    rooms = _rooms_by_split(bases, settings, whole_scenes=whole_scenes)
     died = DatasetError(
         "a process that makes scene variants died, possibly for lack of memory: finished variants are kept; run the "
         "same command again with fewer --jobs"
     )
     here = writer is not None or layout is not None
-    with shared_work(
-        1 if here else jobs, VariantMaker, VariantMaker.make, settings, writer, layout, died=died
-    ) as make:
+    begin, arguments = (making.begin, (settings,)) if making else (VariantMaker, (settings, writer, layout))
+    with shared_work(1 if here else jobs, begin, _make, *arguments, died=died) as make:
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
             orders = _SplitOrders(store, bases, rooms[split], split, target)
             while round_orders := orders.next_round():

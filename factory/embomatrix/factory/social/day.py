@@ -23,6 +23,8 @@ from embomatrix.world.state import Relation, State
 
 MAX_MISSING: Final = 1
 """Maximum number of furniture pieces that a wish may demand without the scene having them."""
+NEVER_ADDED: Final = frozenset({"countertop", "bar", "commercial_kitchen_table"})
+"""Kinds of furniture that are not added to a room, since they are built into others."""
 DECOY_SHARE: Final = 0.5
 OPEN_SHARE: Final = 0.2
 """Share of doors that stand open at the start."""
@@ -58,7 +60,7 @@ def events_for(base: str, cast: Cast) -> list[tuple[Event, Person, int]]:
             continue
         for person in cast.people:
             if event.ages[0] <= person.age <= event.ages[1]:
-                causes = {person.job, person.hobby} & event.of
+                causes = {person.job, person.job.removeprefix("retired "), person.hobby} & event.of
                 if causes or not event.of:
                     found.append((event, person, FITTING_EVENT_WEIGHT if causes else 1))
     return found
@@ -126,6 +128,8 @@ def wish_of(need: Need, view: SceneView, rng: np.random.Generator) -> tuple[Wish
         group, lacks = _group(role, groups, rooms, view, rng)
         groups[role.label] = group
         missing += lacks
+        if lacks and group.kind in NEVER_ADDED:
+            return None
     if missing > MAX_MISSING or not _has_water(need, groups, view, rng):
         return None
     groups = _with_doors(need, groups, rng)

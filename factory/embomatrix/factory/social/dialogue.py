@@ -55,8 +55,8 @@ class _Talk:
         wanted = self._teller.in_short(asked)
         if alike > len(asked.members[asked.conditions[0].things]):
             self._say(ROBOT, Act.CLARIFY, "which", alike=number_word(alike))
-        kind = Act.ANSWER if is_first else Act.ADD
-        self._say(self._person, kind, "add", do=listed(wanted))
+        act, kind = (Act.ANSWER, "answer") if is_first else (Act.ADD, "add")
+        self._say(self._person, act, kind, do=listed(wanted))
 
     def refuse(self) -> None:
         chores = people_table()["chores"]

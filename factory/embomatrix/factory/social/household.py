@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from embomatrix.factory.social.values import Cast, DaySlot, Person
 HELD_OUT_JOBS: Final = 5
 """One in this many jobs belongs to the held-out split."""
 ADULT: Final = 18
+RETIRED: Final = 68
 _PLACES: Final = ("restaurant", "office", "school", "hotel", "hall")
 _SETTINGS: Final = {
     "home": "the people of a home",
@@ -45,13 +46,14 @@ def draw_cast(base: str, rooms: Sequence[str], rng: np.random.Generator, split: 
     count = int(rng.integers(2, 5))
     first = _person(next(names), int(rng.integers(24, 72)), place, rng, split, seed)
     people = [first]
-    ties = people_table()["ties"]
     for _ in range(count - 1):
-        people.append(
-            _relative(first, ties, names, rng, split, seed)
-            if place == "home"
-            else _person(next(names), int(rng.integers(19, 64)), place, rng, split, seed)
-        )
+        name = next(names)
+        if place == "home":
+            known = {tie for person in people for tie in person.ties.values()}
+            taken = frozenset(tie["group"] for tie in people_table()["ties"] if tie["tie"] in known)
+            people.append(_relative(first, taken, name, rng, split, seed))
+        else:
+            people.append(_person(name, int(rng.integers(19, 64)), place, rng, split, seed))
     slots = tuple(
         DaySlot(time="08:00", person=person.name, room=str(room), activity="starting the day")
         for person, room in zip(people, rng.permutation(list(rooms)), strict=False)
@@ -59,7 +61,7 @@ def draw_cast(base: str, rooms: Sequence[str], rng: np.random.Generator, split: 
     return Cast(setting=_SETTINGS[place], people=tuple(people), day=slots)
 
 
-def _names(rng: np.random.Generator) -> Any:
+def _names(rng: np.random.Generator) -> Iterator[str]:
     table = people_table()["names"]
     return iter([str(name) for name in rng.permutation([*table["female"], *table["male"]])])
 
@@ -75,40 +77,31 @@ def _person(
 ) -> Person:
     table = people_table()
     if age < ADULT:
-        return Person(
-            name=name,
-            age=age,
-            job="pupil",
-            hobby=_drawn(table["children"]["hobbies"], rng),
-            ties=dict(ties or {}),
-        )
-    jobs = [
-        job for job in table["jobs"][place] if split == "heldout" or not is_held_out(job, seed, HELD_OUT_JOBS)
-    ]
-    kept = [job for job in jobs if is_held_out(job, seed, HELD_OUT_JOBS)]
-    job = _drawn(kept if kept and rng.random() < 0.5 else jobs, rng)
+        hobby = _drawn(table["children"]["hobbies"], rng)
+        return Person(name=name, age=age, job="pupil", hobby=hobby, ties=dict(ties or {}))
+    ages = table["ages"]
+    fitting = [job for job in table["jobs"][place] if job not in ages or ages[job][0] <= age <= ages[job][1]]
+    kept = [job for job in fitting if is_held_out(job, seed, HELD_OUT_JOBS)]
+    known = [job for job in fitting if job not in kept]
+    job = _drawn(kept if kept and split == "heldout" and rng.random() < 0.5 else known, rng)
+    if age >= RETIRED and not job.startswith("retired"):
+        job = f"retired {job}"
     return Person(
         name=name, age=age, job=job, hobby=_drawn(table["hobbies"]["all"], rng), ties=dict(ties or {})
     )
 
 
 def _relative(
-    first: Person,
-    ties: Sequence[Mapping[str, Any]],
-    names: Any,
-    rng: np.random.Generator,
-    split: str,
-    seed: int,
+    first: Person, taken: frozenset[str], name: str, rng: np.random.Generator, split: str, seed: int
 ) -> Person:
-    """Return a person with a tie to the first one that suits age and name."""
-    name = next(names)
+    """Return a person with a tie to the first one that suits age and name, and that nobody else has unless it may repeat."""
     while True:
+        ties = people_table()["ties"]
         tie = ties[int(rng.integers(len(ties)))]
         low, high = tie["apart"]
         age = first.age + int(rng.integers(low, high + 1))
-        fits = tie.get("female", False) is False or is_female(name)
-        fits = fits and (not tie.get("male", False) or not is_female(name))
-        if fits and 5 <= age <= 95:
+        fits = not (tie.get("female") and not is_female(name)) and not (tie.get("male") and is_female(name))
+        if fits and 5 <= age <= 95 and (tie.get("repeats") or tie["group"] not in taken):
             return _person(name, age, "home", rng, split, seed, {first.name: tie["tie"]})
 
 

@@ -66,7 +66,7 @@ class Teller:
         first = asked[0].need
         speaker = Speaker() if self._rng() < FIRST_PERSON_SHARE else Speaker(first.person.name)
         greeting = "" if speaker.name else self.voice.choose(_GREETINGS).format(name=first.person.name)
-        why = self._personal(self.voice.choose(first.event.why), first, speaker)
+        why = self._personal(_naming(self.voice.choose(first.event.why)), first, speaker)
         is_named = bool(speaker.name) and speaker.name in why
         later = Speaker("She" if is_female(speaker.name) else "He") if is_named else speaker
         said = [sentence for each in asked for sentence in self._requests(each, later)]
@@ -115,6 +115,7 @@ class Teller:
             "my": f"{speaker.name}'s" if speaker.name else "my",
             "their": their if speaker.name else "my",
             "me": them if speaker.name else "me",
+            "Me": speaker.name or "me",
             "time": need.time,
         }
         return _NAME.sub(lambda match: fields.get(match.group(1), match.group(0)), text)
@@ -240,6 +241,13 @@ class Teller:
             for condition in asked.conditions
             if not _is_implied(condition, asked)
         ]
+
+
+def _naming(why: str) -> str:
+    """Return the sentence with the person's name at their first mention, if that is *me* or *my*."""
+    if "{I}" in why:
+        return why
+    return why.replace("{my|their}", "{my}", 1) if "{my|their}" in why else why.replace("{me}", "{Me}", 1)
 
 
 def _is_implied(condition: Condition, asked: Asked) -> bool:
