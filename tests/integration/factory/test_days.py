@@ -1,0 +1,184 @@
+"""Days of simulated people: needs, scenes laid out for them, and the tasks in words."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from embomatrix.factory.days.drafts import DraftWriter, combinations_of
+from embomatrix.factory.days.laying import DayScene, lay_out
+from embomatrix.factory.days.maker import DAYS, DayMaker, need_weights
+from embomatrix.factory.language.kinds import is_held_out
+from embomatrix.factory.pipeline.build import build_dataset, split_scenes
+from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.factory.pipeline.variants import VariantOrder
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.day import NeedOfDay, draw_needs, wish_of
+from embomatrix.factory.social.household import draw_cast
+from embomatrix.factory.social.knowledge import Need, events
+from embomatrix.factory.social.values import Cast
+from embomatrix.factory.social.wish import problem_of
+from embomatrix.factory.writer.tasks import Draft
+from embomatrix.factory.writer.words import FreshVoice
+from embomatrix.world.bddl import parse_problem, render_problem
+from embomatrix.world.dataset import Dataset
+from embomatrix.world.evaluate import ground_size
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import TaskCategory
+
+SCENES = ("Rs_int", "Pomaria_1_int", "restaurant_diner")
+LONG = re.compile(r"\w+_\d+|\{|\}|  ")
+
+
+@pytest.fixture(scope="module")
+def bases() -> dict[str, Scene]:
+    return {name: build_base_scene(name) for name in SCENES}
+
+
+def people(base: Scene, split: str = "train") -> tuple[Cast, np.random.Generator]:
+    rng = np.random.default_rng(zlib.crc32(base.base.encode()))
+    return draw_cast(base.base, [room.name for room in base.rooms], rng, split, 0), rng
+
+
+def drafts(base: Scene, split: str = "train") -> Iterator[tuple[Draft, tuple[NeedOfDay, ...]]]:
+    cast, rng = people(base, split)
+    needs = draw_needs(SceneView(base), cast, 6, 3, rng, {})
+    day = lay_out("day", needs, base, rng)
+    assert isinstance(day, DayScene)
+    writer = DraftWriter(day, cast, split, 0, FreshVoice(rng, Counter()))
+    for number, combination in enumerate(combinations_of(day, rng)):
+        draft = writer.draft(f"task-{number}", combination)
+        if draft is not None:
+            yield draft, combination.needs
+
+
+def needs_by_name() -> dict[str, Need]:
+    return {need.name: need for event in events() for need in event.needs}
+
+
+def test_most_needs_can_be_wished_for_in_some_scene(bases: dict[str, Scene]) -> None:
+    views = [SceneView(base) for base in bases.values()]
+    rng = np.random.default_rng(0)
+    found = [
+        need
+        for need in needs_by_name().values()
+        if any(wish_of(need, view, rng) for view in views for _ in range(4))
+    ]
+    assert len(found) > 0.8 * len(needs_by_name())
+
+
+def test_the_wishes_of_a_day_are_a_bddl_problem_that_parses(bases: dict[str, Scene]) -> None:
+    for base in bases.values():
+        cast, rng = people(base)
+        needs = draw_needs(SceneView(base), cast, 8, 3, rng, {})
+        problem, members = problem_of("day", [need.wish for need in needs])
+        assert parse_problem(render_problem(problem)) == problem
+        assert len(members) == len(needs)
+        for need, names in zip(needs, members, strict=True):
+            assert {len(names[group.label]) == group.count for group in need.wish.objects} == {True}
+
+
+def test_needs_come_from_the_people_of_the_place(bases: dict[str, Scene]) -> None:
+    for base in bases.values():
+        cast, rng = people(base)
+        for need in draw_needs(SceneView(base), cast, 8, 3, rng, {}):
+            person = cast.of(need.person.name)
+            causes = {person.job, person.job.removeprefix("retired "), person.hobby}
+            assert not need.event.of or causes & need.event.of
+            assert need.event.ages[0] <= person.age <= need.event.ages[1]
+
+
+def test_instructions_name_a_person_and_no_object_by_its_name_in_the_scene(bases: dict[str, Scene]) -> None:
+    seen = 0
+    for base in bases.values():
+        cast, _ = people(base)
+        for draft, _ in drafts(base):
+            text = draft.task.instruction
+            assert not LONG.search(text), text
+            assert text[0].isupper()
+            assert draft.task.goal_objects <= set(draft.task.table)
+            assert 1 <= ground_size(draft.task.goal, draft.task.types) <= 40
+            assert any(name in draft.transcript for name in cast.names)
+            seen += 1
+    assert seen >= 6
+
+
+def test_a_thing_that_the_scene_lacks_is_laid_out_for_its_wish(bases: dict[str, Scene]) -> None:
+    base = bases["Rs_int"]
+    view = SceneView(base)
+    rng = np.random.default_rng(4)
+    cast, _ = people(base)
+    need = next(need for event in events() if event.name == "a yoga class" for need in event.needs)
+    wished = wish_of(need, view, rng)
+    assert wished is not None
+    event = next(event for event in events() if event.name == "a yoga class")
+    day = lay_out("yoga", [NeedOfDay(event, cast.people[0], "nine o'clock", need, *wished)], base, rng)
+    assert isinstance(day, DayScene)
+    mats = day.members[0]["mats"]
+    assert len(mats) >= 3
+    assert not any(name in base.by_name for name in mats)
+    assert {day.scene.asset_of(name).category for name in mats} == {"rolled_yoga_mat"}
+
+
+def test_training_has_no_need_and_no_goal_shape_of_the_held_out_split(bases: dict[str, Scene]) -> None:
+    missing = dict.fromkeys(TaskCategory, 10)
+    weights = need_weights("train", 0, missing)
+    held_out = {name for name in weights if is_held_out(name, 0, 5)}
+    assert held_out
+    assert all(weights[name] == 0 for name in held_out)
+    assert all(need_weights("heldout", 0, missing)[name] > 1 for name in held_out)
+
+
+def test_a_day_depends_only_on_settings_and_order() -> None:
+    settings = BuildSettings(look_ahead=False, physical=False, writer=WriterKind.SOCIAL)
+    rooms = tuple(room.name for room in build_base_scene("Pomaria_1_int").rooms)
+    order = VariantOrder("train", 3, "Pomaria_1_int", rooms, dict.fromkeys(TaskCategory, 10), frozenset())
+    first, second = DayMaker(settings), DayMaker(settings)
+    try:
+        one = first.make(order)
+        assert one == second.make(order)
+        assert one == first.make(order)  # a second day of the same maker, with its placements known
+    finally:
+        first.close()
+        second.close()
+    assert one.result.records
+    for record in one.result.records:
+        assert record.intent
+        assert one.transcripts[record.task.task_id].startswith(f"# {record.task.instruction}")
+
+
+def test_held_out_scenes_are_others_than_those_of_training(bases: dict[str, Scene]) -> None:
+    rooms = split_scenes(list(bases.values()), 0)
+    used = {split: {base for base, names in found.items() if names} for split, found in rooms.items()}
+    assert used["train"] | used["heldout"] == set(SCENES)
+    assert not used["train"] & used["heldout"]
+    assert used["heldout"]
+
+
+def test_a_dataset_of_days_is_complete_and_resumes(tmp_path: Path) -> None:
+    settings = BuildSettings(
+        train=4,
+        heldout=0,
+        seed=1,
+        scenes=("Pomaria_1_int",),
+        writer=WriterKind.SOCIAL,
+        look_ahead=False,
+        physical=False,
+    )
+    build_dataset(tmp_path / "one", settings, making=DAYS)
+    dataset = Dataset.load(tmp_path / "one")
+    assert Counter(record.task.category for record in dataset.train) == dict.fromkeys(TaskCategory, 1)
+    log = (tmp_path / "one" / "build.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
+    (tmp_path / "two" / "bundles").mkdir(parents=True)
+    for file in (tmp_path / "one" / "bundles").iterdir():
+        (tmp_path / "two" / "bundles" / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "two" / "build.jsonl").write_text("".join(log[:-1]), encoding="utf-8")
+    build_dataset(tmp_path / "two", settings, making=DAYS)
+    assert Dataset.load(tmp_path / "two").records == dataset.records
