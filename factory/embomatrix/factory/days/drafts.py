@@ -107,11 +107,10 @@ class DraftWriter:
         members: dict[str, tuple[str, ...]] = {}
         for number, (need, names) in enumerate(zip(combination.needs, combination.members, strict=True)):
             for condition in need.wish.conditions:
-                labels = {"things": f"{condition.things}_{number}"}
-                if condition.place:
-                    labels["place"] = f"{condition.place}_{number}"
-                members |= {new: names[getattr(condition, field)] for field, new in labels.items()}
-                conditions.append(condition.model_copy(update=labels))
+                members |= {f"{label}_{number}": names[label] for label in condition.labels}
+                conditions.append(
+                    _renamed(condition, {label: f"{label}_{number}" for label in condition.labels})
+                )
         about = dict.fromkeys(
             name for need in combination.members for names in need.values() for name in names
         )
@@ -203,8 +202,18 @@ def _of_any(condition: Condition) -> Condition:
 
 
 def _without(condition: Condition, suffix: str) -> Condition:
-    labels = {"things": condition.things.removesuffix(suffix), "place": condition.place.removesuffix(suffix)}
-    return condition.model_copy(update=labels)
+    return _renamed(condition, {label: label.removesuffix(suffix) for label in condition.labels})
+
+
+def _renamed(condition: Condition, labels: Mapping[str, str]) -> Condition:
+    """Return the condition with other labels, and its alternative too."""
+    return condition.model_copy(
+        update={
+            "things": labels[condition.things],
+            "place": labels.get(condition.place, ""),
+            "otherwise": condition.otherwise and _renamed(condition.otherwise, labels),
+        }
+    )
 
 
 def _seed_of(task_id: str) -> list[int]:

@@ -50,6 +50,8 @@ TAP: Final = " tap"
 """Ending of the keys of sinks, whose tap is turned on and off."""
 LONG_WORDS: Final = 3
 """Spaces in a noun phrase from which on a particle does not follow it."""
+_PARTICLE_FIRST: Final = re.compile(r"\w+ (?:on|off|up|down|out) \{x\}")
+"""Verbs that no pronoun follows: *turn it on*, not *turn on it*."""
 _PARTICLE: Final = re.compile(r"\{x\} (?:up|down|off|on|open|shut|over|away|again|through)\b(?! \{y\})")
 
 
@@ -213,6 +215,8 @@ def _is_sourced(clause: Clause) -> bool:
 def _verbs(clause: Clause, book: PhraseBook) -> tuple[str, ...]:
     """Return suitable imperatives. A particle does not follow a long noun phrase: *turn on the lamp on the desk*."""
     verbs = book.verbs(clause.key, sourced=_is_sourced(clause))
+    if clause.bare:
+        return tuple(verb for verb in verbs if not _PARTICLE_FIRST.match(verb)) or verbs
     if clause.thing.words.count(" ") < LONG_WORDS:
         return verbs
     return tuple(verb for verb in verbs if not _PARTICLE.search(verb)) or verbs

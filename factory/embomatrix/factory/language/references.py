@@ -175,7 +175,9 @@ class Describer:
             for chosen in itertools.combinations(restrictions, size):
                 if len({key for restriction in chosen for key in restriction}) == sum(map(len, chosen)):
                     changes = {key: value for restriction in chosen for key, value in restriction.items()}
-                    yield dataclasses.replace(head, **changes)
+                    found = dataclasses.replace(head, **changes)
+                    if not found.room or f"in {room_noun(found.room, self.rooms)}" not in found.host_words:
+                        yield found
 
     def _restrictions(self, rows: Sequence[PromptRow]) -> Iterator[Mapping[str, Any]]:
         """Yield restrictions that hold of all rows: a state, a support, a room, contents."""

@@ -139,19 +139,21 @@ def wish_of(need: Need, view: SceneView, rng: np.random.Generator) -> tuple[Wish
     parts = [part for part in need.goal if not _needs_no_door(part, groups)]
     if not parts:
         return None
-    conditions = tuple(
-        Condition(
-            predicate=part.predicate,
-            things=part.things,
-            place=part.place,
-            quantity=part.quantity,
-            count=count if part.quantity is Quantity.EXACTLY else 0,
-            holds=part.holds,
-        )
-        for part in parts
-    )
+    conditions = tuple(_condition(part, count) for part in parts)
     objects = (*groups.values(), *_decoys(need, groups, view, rng))
     return Wish(objects=objects, conditions=conditions), count
+
+
+def _condition(part: GoalPart, count: int) -> Condition:
+    return Condition(
+        predicate=part.predicate,
+        things=part.things,
+        place=part.place,
+        quantity=part.quantity,
+        count=count if part.quantity is Quantity.EXACTLY else 0,
+        holds=part.holds,
+        otherwise=_condition(part.otherwise, count) if part.otherwise is not None else None,
+    )
 
 
 def _needs_no_door(part: GoalPart, groups: Mapping[str, WishedObjects]) -> bool:

@@ -4,6 +4,9 @@ The tables are ``people.toml`` and ``events.toml`` beside this module; the secon
 not follow it raises KnowledgeError.
 """
 
+from __future__ import annotations
+
+import dataclasses
 import functools
 import re
 import tomllib
@@ -77,6 +80,8 @@ class GoalPart:
     place: str = ""
     quantity: Quantity = Quantity.ALL
     holds: bool = True
+    otherwise: GoalPart | None = None
+    """Alternative about other things at the same place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +106,8 @@ class Event:
     places: frozenset[str]
     of: frozenset[str] = frozenset()
     ages: tuple[int, int] = (6, 99)
+    before: tuple[str, ...] = ()
+    """Times by which the needs are to be met, as phrases."""
 
 
 @functools.cache
@@ -137,6 +144,7 @@ def _event(entry: Mapping[str, Any], classes: Mapping[str, list[str]]) -> Event:
         places,
         frozenset(entry.get("of", ())),
         (youngest, oldest),
+        tuple(entry.get("before", ())),
     )
 
 
@@ -144,9 +152,10 @@ def _need(name: str, entry: Mapping[str, Any], classes: Mapping[str, list[str]])
     roles = [_role(line, classes) for line in entry["objects"]]
     goal = tuple(_goal_part(line) for line in entry["goal"])
     labels = {role.label for role in roles}
+    parts = [each for part in goal for each in (part, part.otherwise) if each is not None]
     for label in (
         *(role.host for role in roles),
-        *(word for part in goal for word in (part.things, part.place)),
+        *(word for part in parts for word in (part.things, part.place)),
     ):
         if label and label not in labels:
             raise KnowledgeError(
@@ -175,6 +184,12 @@ def _role(line: str, classes: Mapping[str, list[str]]) -> ObjectRole:
 
 
 def _goal_part(line: str) -> GoalPart:
+    first, _, other = line.partition(" or ")
+    part = _plain_part(first)
+    return dataclasses.replace(part, otherwise=_plain_part(other)) if other else part
+
+
+def _plain_part(line: str) -> GoalPart:
     found = _GOAL.fullmatch(line)
     if found is None or (found["state"] and found["state"] not in _STATES):
         raise KnowledgeError(

@@ -19,7 +19,7 @@ from embomatrix.factory.language.clauses import (
     imperative_of,
     sentence_of,
 )
-from embomatrix.factory.language.nouns import noun_of, number_word
+from embomatrix.factory.language.nouns import listed, noun_of, number_word
 from embomatrix.factory.language.references import Describer, all_of, any_of, exactly, together
 from embomatrix.factory.social.day import NeedOfDay
 from embomatrix.factory.social.household import is_female
@@ -33,6 +33,21 @@ PRONOUN_SHARE: Final = 0.8
 WHENCE_SHARE: Final = 0.6
 TOGETHER_SHARE: Final = 0.6
 """Share of requests with the same place that are told in one clause."""
+BEFORE_SHARE: Final = 0.35
+"""Share of instructions that say by when, if the event has words for it."""
+SAME_SHARE: Final = 0.6
+"""Share of requests that only refer to the one before, if they ask for the same of other things."""
+AT_THE_END: Final = (
+    "In the end",
+    "When you",
+    "Before",
+    "By the time",
+    "The same",
+    "And ",
+    "Do the same",
+    "Likewise",
+)
+"""Beginnings of sentences that take no joint."""
 LIGHTS: Final = frozenset({"table_lamp", "floor_lamp"})
 TAPS: Final = ("_sink", "bathtub")
 _CHOICE: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
@@ -70,6 +85,10 @@ class Teller:
         is_named = bool(speaker.name) and speaker.name in why
         later = Speaker("She" if is_female(speaker.name) else "He") if is_named else speaker
         said = [sentence for each in asked for sentence in self._requests(each, later)]
+        if first.event.before and not said[0].startswith(AT_THE_END) and self._rng() < BEFORE_SHARE:
+            said[0] = (
+                f"{capitalised(self.voice.choose(first.event.before))}, {_lowered(said[0], (speaker.name,))}"
+            )
         return f"{greeting}{capitalised(why)} {self._joined(said, speaker.name)}"
 
     def reason(self, need: NeedOfDay) -> str:
@@ -85,7 +104,8 @@ class Teller:
         for number, sentence in enumerate(sentences):
             last = number == len(sentences) - 1
             kind = "first" if not number else "last" if last else "next"
-            is_plain = len(sentences) > 1 and not sentence.startswith(("In the end", "When you"))
+            is_plain = len(sentences) > 1 and not sentence.startswith(AT_THE_END)
+            is_plain = is_plain and not sentence.endswith("too, please.")
             joint = self.voice.choose(self.book.joints(kind)) if is_plain else ""
             told.append(f"{joint}{_lowered(sentence, (name,))}" if joint else sentence)
         return " ".join(told)
@@ -100,10 +120,27 @@ class Teller:
 
         def words(match: re.Match[str]) -> str:
             label = match.group(1)
-            return number_word(asked.need.count) if label == "k" else self._definite(asked.members[label])
+            return number_word(asked.need.count) if label == "k" else self._known(asked, label)
 
         sentences = re.split(r"(?<=[.!?]) ", _NAME.sub(words, text))
         return " ".join(map(capitalised, sentences))
+
+    def _known(self, asked: Asked, label: str) -> str:
+        """Return words for all objects of a label, or for any one of them if the conditions leave the choice."""
+        names = asked.members[label]
+        is_free = any(each.things == label and each.quantity is Quantity.ANY for each in asked.conditions)
+        is_place = any(each.place == label for each in asked.conditions)
+        if len(names) == 1 or not (is_free or is_place):
+            return self._definite(names)
+        found = self.describer.describe(names)
+        if found is None:
+            raise UndescribableError(", ".join(names))
+        many = self.describer.phrase(found, len(names))
+        return (
+            many
+            if is_free and label in _offered(asked)
+            else self.describer.phrase(found, len(names), "one of the")
+        )
 
     def _personal(self, text: str, need: NeedOfDay, speaker: Speaker) -> str:
         """Fill in the person, their pronouns and the time."""
@@ -136,13 +173,19 @@ class Teller:
         """Return a sentence for each condition. Conditions with the same place may share one; repeated things are pronouns."""
         said: list[str] = []
         before: frozenset[str] = frozenset()
+        last = ("", "")
         for group in self._grouped([each for each in asked.conditions if not _is_implied(each, asked)]):
             names = frozenset(name for each in group for name in asked.members[each.things])
             counted = group[0].quantity in (Quantity.ANY, Quantity.EXACTLY, Quantity.PAIRED)
             bare = names == before and not counted and self._rng() < PRONOUN_SHARE
-            said.append(
-                sentence_of(self._clause(group, asked.members, bare=bare), self.book, self.voice, speaker)
-            )
+            clause = self._clause(group, asked.members, bare=bare)
+            act = (clause.key, clause.place)
+            if act == last and not counted and not bare and self._rng() < SAME_SHARE:
+                words = {"x": clause.thing.words, "X": clause.thing.words}
+                said.append(capitalised(self.voice.choose(self.book.joints("same")).format(**words)))
+            else:
+                said.append(sentence_of(clause, self.book, self.voice, speaker))
+            last = act
             before = names if not counted or len(names) == 1 else frozenset()
         return said
 
@@ -154,6 +197,7 @@ class Teller:
                 last is not None
                 and condition.predicate in PLACED
                 and last.quantity is condition.quantity is Quantity.ALL
+                and last.otherwise is condition.otherwise is None
                 and (last.predicate, last.place) == (condition.predicate, condition.place)
             )
             if same and self._rng() < TOGETHER_SHARE:
@@ -202,7 +246,15 @@ class Teller:
             if of_kind is not None and self._rng() < TOGETHER_SHARE:
                 return all_of(self.describer, of_kind, len(every))
             return together([self._quantified(each, members[each.things]) for each in group])
+        if group[0].otherwise is not None:
+            return self._either(group[0], members)
         return self._quantified(group[0], members[group[0].things])
+
+    def _either(self, condition: Condition, members: Mapping[str, tuple[str, ...]]) -> NounPhrase:
+        """Return *either the muffin or the bagel*."""
+        parts = [part for part in (condition, condition.otherwise) if part is not None]
+        words = [self._definite(members[part.things]) for part in parts]
+        return NounPhrase(f"either {listed(words, 'or')}")
 
     def _quantified(self, condition: Condition, names: Sequence[str]) -> NounPhrase:
         found = self.describer.describe(names)
@@ -241,6 +293,11 @@ class Teller:
             for condition in asked.conditions
             if not _is_implied(condition, asked)
         ]
+
+
+def _offered(asked: Asked) -> frozenset[str]:
+    """Return the labels that the need's own conditions leave a choice of: its sentences say so themselves."""
+    return frozenset(part.things for part in asked.need.need.goal if part.quantity is Quantity.ANY)
 
 
 def _naming(why: str) -> str:
