@@ -13,7 +13,8 @@ import pytest
 
 from embomatrix.factory.days.drafts import DraftWriter, combinations_of
 from embomatrix.factory.days.laying import DayScene, lay_out
-from embomatrix.factory.days.maker import DAYS, DayMaker, need_weights
+from embomatrix.factory.days.maker import DAYS, DayMaker
+from embomatrix.factory.days.planning import need_weights
 from embomatrix.factory.language.kinds import is_held_out
 from embomatrix.factory.pipeline.build import build_dataset, split_scenes
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind

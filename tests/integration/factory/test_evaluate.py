@@ -17,7 +17,14 @@ from embomatrix.factory.evaluate.aesthetics import SPOILERS, Calibration, auc, f
 from embomatrix.factory.evaluate.judges import DiversityScores
 from embomatrix.factory.evaluate.page import BEGIN, END, with_factory
 from embomatrix.factory.evaluate.room_plans import FLOOR, RoomBox, RoomPlan, plan_of, read_rooms
-from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_in, evenness, panel, people_of
+from embomatrix.factory.evaluate.tasks import (
+    DraftFeatures,
+    asked_in,
+    evenness,
+    panel,
+    people_of,
+    society_drafts,
+)
 from embomatrix.factory.metrics.figures import (
     EvaluationError,
     EvaluationFigures,
@@ -25,8 +32,6 @@ from embomatrix.factory.metrics.figures import (
     read_evaluation,
 )
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, training_scenes
-from embomatrix.factory.social.casting import NAMES
-from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError
@@ -162,7 +167,7 @@ def test_both_writers_are_measured_and_one_has_goals():
         DraftFeatures("Mia is cooking: put the mug in the oven.", "inside(mug,oven)", ("kitchen_0",), False),
         DraftFeatures("For Hugo, open a fridge.", "open(fridge)", ("kitchen_0", "bar_0"), True),
     ]
-    figures = {figure.name: figure for figure in panel({"Rs_int": tasks}, NAMES)}
+    figures = {figure.name: figure for figure in panel({"Rs_int": tasks}, {"Mia", "Hugo"})}
     assert figures["named_share"].value == 1
     assert figures["several_rooms_share"].value == figures["quantified_share"].value == 0.5
     assert figures["predicate_entropy"].value == 1
@@ -170,7 +175,7 @@ def test_both_writers_are_measured_and_one_has_goals():
     assert {name for name, figure in figures.items() if figure.goal is not None} == {
         "self_bleu4", "near_duplicate_rate", "named_share", "signature_entropy",
     }  # fmt: skip
-    assert all(figure.goal is None for figure in panel({"Rs_int": tasks}, NAMES, "plain"))
+    assert all(figure.goal is None for figure in panel({"Rs_int": tasks}, {"Mia", "Hugo"}, "plain"))
 
 
 def test_people_are_read_from_transcripts(tmp_path):
@@ -181,9 +186,9 @@ def test_people_are_read_from_transcripts(tmp_path):
 
 
 def test_drafts_of_a_scene_differ_and_depend_only_on_the_seed(flat):
-    first = asked_in(flat, SocialWriter(0), 6, 0)
+    first = asked_in(flat, society_drafts, 6, 0)
     assert len({asked.instruction for asked in first}) == 6
-    assert first == asked_in(flat, SocialWriter(0), 6, 0)
+    assert first == asked_in(flat, society_drafts, 6, 0)
 
 
 def test_training_and_held_out_scenes_partition_all_scenes():

@@ -10,8 +10,8 @@ from dataclasses import replace
 from typing import Final
 
 from embomatrix.factory.faithfulness.clauses import goal_clauses
+from embomatrix.factory.language.nouns import noun_of
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.phrases import spoken_category
 from embomatrix.factory.writer.words import spoken
 from embomatrix.world.intent import IntentClause
 from embomatrix.world.state import THERMAL, Relation, State
@@ -88,7 +88,7 @@ def _of_clause(
 
 def nouns_of(category: str) -> tuple[str, ...]:
     """Return the nouns for a category."""
-    return tuple(dict.fromkeys((spoken(category).lower(), spoken_category(category).lower())))
+    return tuple(dict.fromkeys((spoken(category).lower(), noun_of(category).one.lower())))
 
 
 def _is_mentioned(text: str, noun: str) -> bool:
