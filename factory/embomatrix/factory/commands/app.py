@@ -153,15 +153,22 @@ def generate(
             return
         writer, ledger = stack.enter_context(
             model_task_writer(
-                llm, model, key, cassette, price=Price(*price), accounts=out / "ledger.jsonl", look=look
+                llm,
+                model,
+                key,
+                cassette,
+                price=Price(*price),
+                accounts=out / "ledger.jsonl",
+                look=look,
+                seed=seed,
             )
         )
-        make_dataset(out, settings, writer, check=check, layout=layout)
-        _print_account(ledger)
+        summary = make_dataset(out, settings, writer, check=check, layout=layout)
+        _print_account(ledger, sum(map(summary.total, ("train", "heldout"))))
 
 
-def _print_account(ledger: Ledger) -> None:
-    """Print the model's calls, tokens and cost by agent."""
+def _print_account(ledger: Ledger, admitted: int) -> None:
+    """Print the model's calls, tokens and cost by agent, then calls and tokens for each admitted task."""
     show_table(
         ("agent", "calls", "failed", "retries", "tokens in", "tokens out", "seconds", "cost"),
         (
@@ -169,6 +176,10 @@ def _print_account(ledger: Ledger) -> None:
             for purpose, account in (*ledger.accounts.items(), ("all", ledger.total()))
         ),
     )
+    total = ledger.total()
+    tokens = total.prompt_tokens + total.completion_tokens
+    if admitted and total.calls:
+        say(f"{total.calls / admitted:.1f} calls and {tokens / admitted:,.0f} tokens for each admitted task")
 
 
 @app.command("list")
