@@ -28,6 +28,10 @@ _REMOVAL: Final = re.compile(
 """Words that say that an object is to leave its place."""
 _COUNT_WORDS: Final = 5
 """Words before a noun that may count it."""
+_LIMITS: Final = frozenset({"least", "most", "up", "more", "fewer", "about"})
+"""Words that turn a number into a limit."""
+_ALTERNATIVE: Final = re.compile(r"\b(?:or|either|whichever|otherwise|else|instead|alternatively)\b")
+_PREMISE: Final = re.compile(r"\b(?:if|unless|in case|provided)\b(?! (?:you|possible|necessary|need|that's))")
 _CLEANED: Final = frozenset({WishPredicate.DUSTY, WishPredicate.STAINED})
 
 
@@ -48,6 +52,7 @@ class InstructionRules:
             *self._unmentioned(),
             *self._unasked_objects(),
             *self._demands(),
+            *self._connectives(),
             *self._relations(),
             *self._counts(),
             *self._wrong_rooms(),
@@ -115,6 +120,18 @@ class InstructionRules:
                 FaultKind.UNSCORED, f"the robot can't {stated.other_work}, and no condition demands it"
             )
 
+    def _connectives(self) -> Iterator[Fault]:
+        """Compare alternatives and premises with the words *or* and *if*."""
+        text = self._reading.plain
+        if any(part.otherwise for part in self._parts) and not _ALTERNATIVE.search(text):
+            yield Fault(FaultKind.UNSTATED, "no word such as or states the alternative of a condition")
+        has_premise = any(part.provided for part in self._parts)
+        premise = _PREMISE.search(text)
+        if has_premise and not premise:
+            yield Fault(FaultKind.UNSTATED, "no word such as if states the premise of a condition")
+        if premise and not has_premise:
+            yield Fault(FaultKind.UNSCORED, f"{premise.group()!r} states a premise, and no condition has one")
+
     def _relations(self) -> Iterator[Fault]:
         """Compare the prepositions before each place with the relation of its conditions."""
         for part in self._parts:
@@ -123,6 +140,8 @@ class InstructionRules:
             place = self._groups[part.place]
             mentions = self._mentions_of(place)
             said = set(self._reading.relations_to(mentions))
+            if is_negative(part):
+                said |= set(self._reading.departures_from(mentions))
             if mentions and part.predicate not in said:
                 name = spoken_category(place.kind)
                 found = ", ".join(sorted(said)) or "no relation"
@@ -245,7 +264,7 @@ def _is_counted(condition: Condition, group: WishedObjects, mention: Mention, re
     quantity = condition.quantity if group.count > 1 else Quantity.ALL
     match quantity:
         case Quantity.EXACTLY:
-            return number == condition.count
+            return number == condition.count and not words & _LIMITS
         case Quantity.ANY:
             return bool(words & INDEFINITE) and not words & (UNIVERSAL - {"everything"})
         case Quantity.NONE:

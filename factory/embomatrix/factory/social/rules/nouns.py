@@ -51,18 +51,20 @@ NOT_OBJECTS: Final = frozenset(
         "can", "may", "will", "like", "well", "back", "top", "side", "front", "middle", "bottom", "light", "order",
         "use", "water", "minute", "second", "hand", "home", "house", "room", "family", "child", "cook", "watch",
         "iron", "cover", "match", "post", "present", "fan", "step", "square", "face", "cut", "slice", "half",
-        "it", "door", "lid", "handle", "button", "switch",
+        "it", "stand", "door", "lid", "handle", "button", "switch",
         "meal", "dinner", "breakfast", "lunch", "supper", "background", "address", "air", "heat",
     )
 )  # fmt: skip
 """Words that are names in the catalog but rarely the objects of a request."""
 _DETERMINERS: Final = frozenset(
     (
-        "the", "a", "an", "this", "that", "these", "those", "my", "your", "his", "her", "our", "their", "its",
+        "the", "a", "an", "this", "these", "those", "my", "your", "his", "her", "our", "their", "its",
         "all", "both", "every", "each", "any", "some", "no", "another", "other", "of", "one", "two", "three",
         "four", "five", "six", "seven", "eight",
     )
 )  # fmt: skip
+_BREAKS: Final = frozenset({"that", "which", "who", "to", "will", "can", "may", "and"})
+"""Words between a determiner and a verb that looks like a noun, as in *the cups that stand there*."""
 WORD: Final = re.compile(r"[a-z0-9]+(?:['’][a-z]+)?|[.,;:!?]")
 """Word or punctuation mark of lower-case text."""
 
@@ -181,6 +183,10 @@ def singulars(word: str) -> Iterator[str]:
 def is_object_of_request(mention: Mention, tokens: tuple[str, ...]) -> bool:
     """True if the noun stands where an object of a request does: after a determiner, or in the plural."""
     before = tokens[max(0, mention.start - 3) : mention.start]
+    for at, word in enumerate(before):
+        if word in _BREAKS:
+            before = before[at + 1 :]
+            break
     determined = any(word in _DETERMINERS or word.endswith(("'s", "’s")) for word in before)
     return bool(kinds_called(mention.noun)) and (determined or mention.is_plural)
 

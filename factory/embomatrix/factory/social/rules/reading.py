@@ -7,7 +7,7 @@ from typing import Final
 
 from embomatrix.factory.social.rules.nouns import Mention, mentions_in, tokens_of
 from embomatrix.factory.social.rules.vocabulary import ACTIONS
-from embomatrix.factory.social.wish import WishPredicate
+from embomatrix.factory.social.wish import PLACED, WishPredicate
 
 NOUN: Final = "object"
 """Word that stands for a noun in the plain text."""
@@ -22,15 +22,11 @@ _RELATIONS: Final = {
     "onto": WishPredicate.ONTOP,
     "upon": WishPredicate.ONTOP,
     "atop": WishPredicate.ONTOP,
-    "off": WishPredicate.ONTOP,
     "to": WishPredicate.ONTOP,
     "in": WishPredicate.INSIDE,
     "into": WishPredicate.INSIDE,
     "inside": WishPredicate.INSIDE,
     "within": WishPredicate.INSIDE,
-    "out": WishPredicate.INSIDE,
-    "from": None,
-    "with": None,
     "under": WishPredicate.UNDER,
     "underneath": WishPredicate.UNDER,
     "beneath": WishPredicate.UNDER,
@@ -42,10 +38,18 @@ _RELATIONS: Final = {
     "next": WishPredicate.NEXTTO,
     "close": WishPredicate.NEXTTO,
 }
-"""Relation that a preposition states; None for prepositions that fit any."""
+"""Relation that a preposition states."""
+_DEPARTURES: Final = {
+    "off": (WishPredicate.ONTOP,),
+    "out": (WishPredicate.INSIDE,),
+    "from": tuple(sorted(PLACED)),
+}
+"""Relations that end according to a preposition."""
 _PRONOUNS: Final = frozenset({"it", "them", "there", "one"})
 _REACH: Final = 6
 """Words between a preposition and the noun of its place."""
+_JOINT: Final = 2
+"""Words between two joined nouns: *or the*."""
 _STOPS: Final = frozenset(
     (*".,;:!?", "and", "then", "or", "but", "put", "is", "are", "open", "that", "which")
 )
@@ -79,13 +83,30 @@ class Reading:
     def relations_to(self, mentions: Sequence[Mention]) -> Iterator[WishPredicate]:
         """Yield the relations that prepositions state to one of these nouns, or to a pronoun that follows one."""
         for mention in mentions:
-            yield from _relations(self.before(mention, _REACH))
+            yield from _relations(self._governing(mention))
         first = min((mention.start for mention in mentions), default=len(self.tokens))
         for at in range(first, len(self.tokens)):
             if self.tokens[at] in _PRONOUNS:
                 yield from _relations(self.tokens[max(0, at - 2) : at])
         if any(token == "inside" for token in self.tokens[first:]):
             yield WishPredicate.INSIDE
+
+    def departures_from(self, mentions: Sequence[Mention]) -> Iterator[WishPredicate]:
+        """Yield the relations to one of these nouns that shall end: *off the sofa*, *out of the box*."""
+        for mention in mentions:
+            words = [word for word in self._governing(mention) if word in _DEPARTURES]
+            if words:
+                yield from _DEPARTURES[words[-1]]
+
+    def _governing(self, mention: Mention) -> tuple[str, ...]:
+        """Return the words before the noun, or before the one that it is joined to: *on the sofa or the bed*."""
+        words = self.before(mention, _REACH)
+        for other in self.mentions:
+            joint = self.tokens[other.end : mention.start]
+            is_joined = bool(joint) and len(joint) <= _JOINT and joint[0] in ("or", "and")
+            if is_joined and not any(word in _RELATIONS for word in joint):
+                return self._governing(other)
+        return words
 
     def clause_before(self, mention: Mention) -> str:
         """Return the words of the noun's clause that come before it."""
@@ -136,17 +157,17 @@ def _follows_determiner(tokens: tuple[str, ...], mention: Mention) -> bool:
 
 
 def _relations(words: Sequence[str]) -> Iterator[WishPredicate]:
-    """Yield the relation of the last preposition among the words; of each that fits if it fits any."""
+    """Yield the relation of the last preposition among the words; none if it says that a relation ends."""
     for at in range(len(words) - 1, -1, -1):
         word = words[at]
+        if word in _DEPARTURES:
+            return
         if word not in _RELATIONS:
             continue
         previous = words[at - 1] if at else ""
         if word == "to" and previous in ("next", "close"):
             word = "next"
-        relation = _RELATIONS[word]
-        if relation is not None:
-            yield relation
+        yield _RELATIONS[word]
         if word == "to":
             yield WishPredicate.INSIDE
         return

@@ -59,8 +59,10 @@ OTHER_WORK: Final = (
 )
 """Verbs of work that the robot does not do."""
 NEGATION: Final = (
-    r"(?:don['’]t|do not|not|never|no|none|without|nothing|neither|nor|avoid|won['’]t|mustn['’]t|can['’]t)"
+    r"(?:don['’]t|do not|not|never|no|none|without|nothing|neither|nor|avoid|"
+    r"rather than|won['’]t|mustn['’]t|can['’]t)"
 )
+"""Words that turn a demand into its contrary."""
 _NARRATED: Final = re.compile(
     r"\b(?:finished|done|stopped|is|are|was|were|been|loves?|likes?|before|after|while|from|of) $"
 )
