@@ -15,7 +15,6 @@ from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.model.agents import SocialModelAgents
-from embomatrix.factory.social.model.drafts import VariantModelWriter
 from embomatrix.factory.social.model.writer import ModelWriter
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.cassette import Cassette
@@ -101,7 +100,7 @@ def layout_agents(
 
 
 @contextlib.contextmanager
-def model_task_writer(
+def model_request_writer(
     url: str,
     model: str,
     key: str,
@@ -111,8 +110,8 @@ def model_task_writer(
     accounts: Path,
     look: bool,
     seed: int,
-) -> Iterator[tuple[VariantModelWriter, Ledger]]:
-    """Yield a task writer on a language model, and the ledger of its costs.
+) -> Iterator[tuple[ModelWriter, Ledger]]:
+    """Yield a writer of requests on a language model, and the ledger of its costs.
 
     ``accounts`` is the ledger's file. With ``look``, the model sees pictures of each base scene, built with ``seed``.
     Raise EndpointError or CassetteError.
@@ -130,7 +129,7 @@ def model_task_writer(
         return sights_of(build_base_scene(base, seed=seed))
 
     with ModelWriter(SocialModelAgents(chat), endpoint, sights if look else None) as writer:
-        yield VariantModelWriter(writer), ledger
+        yield writer, ledger
 
 
 def model_backed_agents(forms: list[str] | None) -> frozenset[AgentName]:
