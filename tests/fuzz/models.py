@@ -51,8 +51,15 @@ from embomatrix.factory.pipeline.store import (
     build_settings,
 )
 from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS
-from embomatrix.factory.social.model_agents import ConversationAnswer, RoomSighting
-from embomatrix.factory.social.requests import TaskRequest
+from embomatrix.factory.social.model.answers import (
+    DayAnswer,
+    PeopleAnswer,
+    PersonTurn,
+    ReadingAnswer,
+    RobotTurn,
+    RoomSighting,
+    SummaryAnswer,
+)
 from embomatrix.factory.social.values import Cast
 from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.endpoint import _Failure, _judged, _reply
@@ -64,7 +71,18 @@ from embomatrix.world.dataset import TASKS_FILE, DatasetError
 
 # Language models
 
-SHAPES = (Cast, ConversationAnswer, TaskRequest, RoomSighting, DiversityScores, Impression)
+SHAPES = (
+    Cast,
+    PeopleAnswer,
+    DayAnswer,
+    PersonTurn,
+    RobotTurn,
+    SummaryAnswer,
+    ReadingAnswer,
+    RoomSighting,
+    DiversityScores,
+    Impression,
+)
 CAST = {
     "setting": "a flat",
     "people": [{"name": name, "age": 30, "job": "cook", "hobby": "chess"} for name in ("Ann", "Ben")],
@@ -272,24 +290,32 @@ def table() -> dict[str, Decoder]:
         b'{"question": "q", "number": 0, "purpose": "p", "text": "a\xe2\x80\xa8b", "model": "m", "prompt_tokens": 1,'
         b' "completion_tokens": 1, "finish": "stop"}\n'
     )
-    talk = {
-        "turns": [
-            {"speaker": "Ann", "act": act, "text": "Please."}
-            for act in ("need", "clarify", "answer", "confirm")
-        ],
-        "first_wish": "a clean cup",
-        "last_wishes": ["a clean cup"],
+    summary = {
+        "requests": [
+            {
+                "instruction": "Please put the cup on the table.",
+                "wish": {
+                    "objects": [
+                        {"label": "table", "kind": "coffee_table", "room": "kitchen_0", "furniture": True},
+                        {"label": "cup", "kind": "mug", "room": "kitchen_0"},
+                    ],
+                    "conditions": [{"predicate": "ontop", "things": "cup", "place": "table"}],
+                },
+            }
+        ]
     }
-    wish = {
-        "instruction": "Put the cup on the table.",
-        "wishes": [{"predicate": "ontop", "thing": "cup_1", "place": "table_1"}],
-    }
+    reading = {"answers": [{"conditions": [{"predicate": "ontop", "thing": "cup", "place": "table"}]}]}
+    event = {**CAST["day"][0], "needs": ["The cup should be on the table."]}
     typed = [
         json.dumps(value).encode()
         for value in (
             CAST,
-            talk,
-            wish,
+            {key: CAST[key] for key in ("setting", "people")},
+            {"events": [event, event]},
+            {"act": "need", "text": "The cup is missing."},
+            {"act": "confirm", "text": "I will bring it."},
+            summary,
+            reading,
             {"rooms": {"kitchen_0": "A bright kitchen with a table."}},
             {"variety": 3, "characters": 4, "overall": 5, "explanation": "varied"},
         )

@@ -4,7 +4,7 @@ import asyncio
 from contextlib import AbstractAsyncContextManager
 from typing import Final, Self
 
-from embomatrix.llm.values import EndpointError
+from embomatrix.llm.values import LlmError
 
 MOST_UNANSWERED: Final = 3
 """Consecutive questions without an answer, each retried, after which an endpoint counts as dead."""
@@ -31,7 +31,7 @@ async def _close(endpoint: AbstractAsyncContextManager[object]) -> None:
 
 
 class FailureLimit:
-    """Counter of consecutive unanswered questions: a batch survives a few, but not a dead endpoint."""
+    """Counter of consecutive questions without a usable answer: a batch survives a few, but no dead endpoint."""
 
     def __init__(self, most: int = MOST_UNANSWERED) -> None:
         self._most = most
@@ -41,8 +41,8 @@ class FailureLimit:
         """Reset the counter."""
         self._unanswered = 0
 
-    def unanswered(self, error: EndpointError) -> None:
-        """Count an unanswered question. Raises the error when the limit is reached."""
+    def unanswered(self, error: LlmError) -> None:
+        """Count a question without a usable answer. Raises the error when the limit is reached."""
         self._unanswered += 1
         if self._unanswered >= self._most:
             raise error

@@ -8,9 +8,12 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import logging
 import random
+import re
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
 import httpx
@@ -18,8 +21,12 @@ import httpx
 from embomatrix.host.backoff import Backoff
 from embomatrix.llm.values import ChatRequest, EndpointError, Message, Reply, Usage
 
+logger = logging.getLogger(__name__)
+
 RETRIED: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Statuses that are worth a retry."""
+NO_SCHEMAS: Final = frozenset({400, 415, 422, 501})
+"""Statuses of endpoints that take no ``response_format``."""
 MAX_REPLY_BYTES: Final = 8 * 1024 * 1024
 MAX_RETRY_AFTER_S: Final = 60.0
 MOST_TOKENS: Final = 10**9
@@ -45,7 +52,9 @@ class EndpointLimits:
 class Endpoint:
     """Async context manager over one endpoint. ``base_url`` is the part before ``/chat/completions``.
 
-    ``jitter`` randomises the waits, so that calls that failed together are not retried together.
+    The JSON schema of an answer is sent as ``response_format``, so that the endpoint constrains the answer. With
+    ``constrain=False``, or after the endpoint refused a schema, the prompt quotes the schema instead. ``jitter``
+    randomises the waits, so that calls that failed together are not retried together.
     """
 
     def __init__(
@@ -56,8 +65,10 @@ class Endpoint:
         api_key: str = "",
         limits: EndpointLimits | None = None,
         jitter: random.Random | None = None,
+        constrain: bool = True,
     ) -> None:
         self.model = model
+        self.constrain = constrain
         self._url = f"{base_url.rstrip('/')}/chat/completions"
         self._limits = limits or EndpointLimits()
         self._jitter = jitter or random.Random()
@@ -73,16 +84,20 @@ class Endpoint:
 
     async def complete(self, request: ChatRequest) -> Reply:
         """Ask, and retry where that may help. Raises EndpointError."""
-        body = self._body(request)
+        constrain = self.constrain and request.json_schema is not None
         backoff = Backoff(
             self._limits.first_wait_s, self._limits.longest_wait_s, lambda: self._jitter.uniform(0.5, 1.0)
         )
         async with self._gate:
             began_s = time.monotonic()
             for attempt in range(self._limits.attempts):
-                found = await self._attempt(body)
+                found = await self._attempt(self._body(request, constrain))
                 if not isinstance(found, _Failure):
+                    self._learn(request, constrain)
                     return _reply(found, self.model, time.monotonic() - began_s, attempt)
+                if constrain and found.status in NO_SCHEMAS and attempt + 1 < self._limits.attempts:
+                    constrain = False
+                    continue
                 wait_s = backoff.next_s()
                 if found.retry_after_s is not None:
                     wait_s = min(found.retry_after_s, MAX_RETRY_AFTER_S)
@@ -93,15 +108,28 @@ class Endpoint:
                 await asyncio.sleep(wait_s)
         raise AssertionError("the last attempt returns or raises")
 
-    def _body(self, request: ChatRequest) -> dict[str, Any]:
+    def _learn(self, request: ChatRequest, constrained: bool) -> None:
+        """Send no more schemas to an endpoint that answered only without one."""
+        if self.constrain and not constrained and request.json_schema is not None:
+            logger.warning("%s takes no JSON schema of an answer: prompts quote it from now on", self._url)
+            self.constrain = False
+
+    def _body(self, request: ChatRequest, constrain: bool) -> dict[str, Any]:
+        messages = request.messages
+        if request.json_schema is not None and not constrain:
+            messages = _with_schema(messages, request.json_schema)
         body: dict[str, Any] = {
             "model": self.model,
-            "messages": [_message(message) for message in request.messages],
+            "messages": [_message(message) for message in messages],
             "max_tokens": request.max_tokens,
             "temperature": request.temperature,
         }
         if request.seed is not None:
             body["seed"] = request.seed
+        if constrain:
+            name = re.sub(r"\W+", "_", request.purpose)
+            form = {"name": name, "schema": request.json_schema}
+            body["response_format"] = {"type": "json_schema", "json_schema": form}
         return body
 
     async def _attempt(self, body: dict[str, Any]) -> dict[str, Any] | _Failure:
@@ -133,6 +161,7 @@ class _Failure:
     transient: bool
     retry_after_s: float | None = None
     remedy: str = "check its address, its model's name and its key"
+    status: int = 0
 
 
 def _judged(response: httpx.Response, data: bytes) -> dict[str, Any] | _Failure:
@@ -144,7 +173,11 @@ def _judged(response: httpx.Response, data: bytes) -> dict[str, Any] | _Failure:
             remedy="it is overloaded or broken: try again later",
         )
     if response.status_code != httpx.codes.OK:
-        return _Failure(f"it answered {response.status_code} ({_quoted(data)})", transient=False)
+        return _Failure(
+            f"it answered {response.status_code} ({_quoted(data)})",
+            transient=False,
+            status=response.status_code,
+        )
     try:
         value: dict[str, Any] = json.loads(data)
         if isinstance(value["choices"][0]["message"], dict):
@@ -165,6 +198,13 @@ def _retry_after(response: httpx.Response) -> float | None:
 def _quoted(data: bytes) -> str:
     text = " ".join(data.decode("utf-8", errors="replace").split())
     return f"{text[:QUOTED]}…" if len(text) > QUOTED else text or "no text"
+
+
+def _with_schema(messages: tuple[Message, ...], schema: Mapping[str, Any]) -> tuple[Message, ...]:
+    """Return the messages with the schema quoted at the end of the first one."""
+    first, *others = messages
+    quoted = f"{first.text}\nThe answer is JSON of this schema: {json.dumps(schema, separators=(',', ':'))}"
+    return (replace(first, text=quoted), *others)
 
 
 def _message(message: Message) -> dict[str, Any]:

@@ -25,7 +25,7 @@ class Message:
 class ChatRequest:
     """One question. ``purpose`` names the asking component, for ledger and errors; it is not sent.
 
-    ``json_schema`` is the form of the answer. It is not sent either, but identifies the question in a cassette.
+    ``json_schema`` is the form of the answer. The endpoint sends it or quotes it in the prompt.
     """
 
     purpose: str

@@ -8,7 +8,6 @@ import pytest
 from embomatrix.factory.pipeline.task_poses import SceneSurvey
 from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import CapableRobot, SceneView
-from embomatrix.factory.social.requests import RequestedAtom, RequestPredicate, TaskRequest, check_request
 from embomatrix.factory.writer.tasks import DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.sim.physical.survey import ReachabilitySurvey
@@ -98,21 +97,3 @@ def test_survey_answers_do_not_depend_on_the_order_of_queries(home: Scene) -> No
         assert not bit_by_bit.blocks([(Handling.TAKE, "apple_1")])
         assert bit_by_bit.poses(names) == at_once.poses(names)
         assert set(bit_by_bit.poses(names[:1]).stands) == {"apple_1"}
-
-
-@pytest.mark.parametrize(
-    ("wish", "sentence"),
-    [
-        (RequestedAtom(predicate=RequestPredicate.TOGGLED_ON, thing="stove_1"), "can't reach stove_1"),
-        (RequestedAtom(predicate=RequestPredicate.HOT, thing="apple_1"), "can't reach apple_1"),
-        (
-            RequestedAtom(predicate=RequestPredicate.ONTOP, thing="mug_1", place="stove_1"),
-            "can't place mug_1 there",
-        ),
-    ],
-)
-def test_infeasible_request_is_reported_to_the_model(home: Scene, wish: RequestedAtom, sentence: str) -> None:
-    request = TaskRequest(instruction="Please do this for me.", wishes=(wish,))
-    with pytest.raises(ValueError, match=f"the robot tried and {sentence}"):
-        check_request(request, SceneView(home, Clumsy()), frozenset(home.by_name))
-    check_request(request, SceneView(home), frozenset(home.by_name))

@@ -10,7 +10,8 @@ from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.search import BindingOptions
 from embomatrix.factory.task_import.start_state import with_states
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
-from embomatrix.factory.task_import.task_fields import category_of, instruction_of
+from embomatrix.factory.task_import.task_fields import instruction_of
+from embomatrix.factory.writer.categories import category_of
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, InitLiteral, parse_formula, parse_problem

@@ -1,7 +1,6 @@
 """Each social agent runs alone; its answer is the input of the next agent."""
 
 import json
-from pathlib import Path
 
 import pytest
 from tests.fakes.chat_server import ChatServer
@@ -9,6 +8,7 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.commands.agents import ALL_AGENTS
 from embomatrix.factory.commands.app import app
+from embomatrix.factory.evaluate.lies import LieTable
 from embomatrix.factory.layout.agent_interfaces import AgentName
 from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent
 from embomatrix.factory.social.values import SummaryBrief, TalkBrief
@@ -45,11 +45,33 @@ def test_scene_facts_list_the_rooms() -> None:
     assert {room["name"] for room in facts["rooms"]} >= {"kitchen_0", "living_room_0"}
 
 
-def test_language_model_plays_the_people_on_request(tmp_path: Path) -> None:
+def test_language_model_plays_the_people_on_request() -> None:
     cast = SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
-    with ChatServer("no", cast.model_dump_json()).serving() as url:
+    people = {"setting": cast.setting, "people": [person.model_dump() for person in cast.people]}
+    events = [{**slot.model_dump(), "needs": ["The cup should be on the table."]} for slot in cast.day[:3]]
+    with ChatServer("no", json.dumps(people), json.dumps({"events": events})).serving() as url:
         found = run("role-player", BRIEF, "--llm", url, "--model", "small-1")
-    assert SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(found) == TalkBrief(scene="Rs_int", cast=cast, seed=1)
+    planned = cast.model_copy(update={"day": cast.day[:3]})
+    assert SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(found) == TalkBrief(scene="Rs_int", cast=planned, seed=1)
+
+
+def test_language_models_hold_a_dialogue_and_summarise_it() -> None:
+    cast = SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
+    events = [{**slot.model_dump(), "needs": ["The book should be on the sofa."]} for slot in cast.day[:2]]
+    need, confirm = {"act": "need", "text": "My book."}, {"act": "confirm", "text": "I will bring it."}
+    clarify, answer = {"act": "clarify", "text": "Where to?"}, {"act": "answer", "text": "The sofa."}
+    turns = [json.dumps(turn) for turn in (need, clarify, answer, confirm)]
+    brief = TalkBrief(scene="Rs_int", cast=cast, seed=1).model_dump_json()
+    with ChatServer(json.dumps({"events": events}), *turns).serving() as url:
+        talk = run("social-simulator", brief, "--llm", url, "--model", "small-1")
+    summary_brief = SOCIAL_AGENTS[SocialAgent.SUMMARIZER].read(talk)
+    assert [turn.text for turn in summary_brief.conversation.turns] == [
+        "My book.", "Where to?", "The sofa.", "I will bring it.",
+    ]  # fmt: skip
+    honest = LieTable.load().honest[0].answer()
+    with ChatServer(json.dumps({"requests": [honest]})).serving() as url:
+        summary = json.loads(run("summarizer", talk, "--llm", url, "--model", "small-1"))
+    assert summary["instruction"] == honest["instruction"]
 
 
 @pytest.mark.parametrize(

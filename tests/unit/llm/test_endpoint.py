@@ -126,3 +126,40 @@ async def test_concurrency_is_bounded():
             replies = await asyncio.gather(*(endpoint.complete(QUESTION) for _ in range(12)))
     assert [reply.text for reply in replies] == ["a"] * 12
     assert server.most_at_once == 3
+
+
+SHAPED = replace(QUESTION, json_schema={"type": "object", "required": ["people"]})
+
+
+async def test_schema_of_the_answer_is_sent_and_not_quoted():
+    server = ChatServer("{}")
+    await asked(server, SHAPED)
+    sent = server.requests[0]
+    form = {"name": "cast", "schema": SHAPED.json_schema}
+    assert sent["response_format"] == {"type": "json_schema", "json_schema": form}
+    assert not any("required" in message["content"] for message in sent["messages"])
+
+
+async def test_endpoint_that_refuses_schemas_reads_them_in_the_prompt_from_then_on():
+    server = ChatServer((422, {}, "response_format: extra field", 0.0), "{}", "{}")
+    with server.serving() as url:
+        async with Endpoint(url, "small-1", limits=QUICK) as endpoint:
+            await endpoint.complete(SHAPED)
+            await endpoint.complete(SHAPED)
+    first, *others = server.requests
+    assert "response_format" in first
+    assert len(others) == 2
+    for sent in others:
+        assert "response_format" not in sent
+        assert '"required":["people"]' in sent["messages"][0]["content"]
+
+
+async def test_refusal_for_another_reason_keeps_schemas_on_the_wire():
+    refused = (400, {}, "the prompt is too long", 0.0)
+    server = ChatServer(refused, refused, "{}")
+    with server.serving() as url:
+        async with Endpoint(url, "small-1", limits=QUICK) as endpoint:
+            with pytest.raises(EndpointError, match="the prompt is too long"):
+                await endpoint.complete(SHAPED)
+            await endpoint.complete(SHAPED)
+    assert "response_format" in server.requests[2]

@@ -24,7 +24,7 @@ from embomatrix.factory.commands.language_model import (
     Tape,
     layout_agents,
     model_backed_agents,
-    model_task_writer,
+    model_request_writer,
 )
 from embomatrix.factory.commands.layout import lay
 from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics
@@ -35,6 +35,7 @@ from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
+from embomatrix.factory.social.model.drafts import VariantModelWriter
 from embomatrix.host.commands import command_group
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
@@ -152,16 +153,23 @@ def generate(
             make_dataset(out, settings, jobs=jobs, check=check, layout=layout)
             return
         writer, ledger = stack.enter_context(
-            model_task_writer(
-                llm, model, key, cassette, price=Price(*price), accounts=out / "ledger.jsonl", look=look
+            model_request_writer(
+                llm,
+                model,
+                key,
+                cassette,
+                price=Price(*price),
+                accounts=out / "ledger.jsonl",
+                look=look,
+                seed=seed,
             )
         )
-        make_dataset(out, settings, writer, check=check, layout=layout)
-        _print_account(ledger)
+        summary = make_dataset(out, settings, VariantModelWriter(writer), check=check, layout=layout)
+        _print_account(ledger, sum(map(summary.total, ("train", "heldout"))))
 
 
-def _print_account(ledger: Ledger) -> None:
-    """Print the model's calls, tokens and cost by agent."""
+def _print_account(ledger: Ledger, admitted: int) -> None:
+    """Print the model's calls, tokens and cost by agent, then calls and tokens for each admitted task."""
     show_table(
         ("agent", "calls", "failed", "retries", "tokens in", "tokens out", "seconds", "cost"),
         (
@@ -169,6 +177,10 @@ def _print_account(ledger: Ledger) -> None:
             for purpose, account in (*ledger.accounts.items(), ("all", ledger.total()))
         ),
     )
+    total = ledger.total()
+    tokens = total.prompt_tokens + total.completion_tokens
+    if admitted and total.calls:
+        say(f"{total.calls / admitted:.1f} calls and {tokens / admitted:,.0f} tokens for each admitted task")
 
 
 @app.command("list")

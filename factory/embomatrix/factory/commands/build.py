@@ -20,8 +20,8 @@ def make_dataset(
     jobs: int | None = None,
     check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
-) -> None:
-    """Build the dataset with progress bars, then print a summary. Exit if it has too few tasks."""
+) -> BuildSummary:
+    """Build the dataset with progress bars, print a summary and return it. Exit if it has too few tasks."""
     making = DAYS if settings.writer is WriterKind.SOCIAL else None
     kept = f": finished tasks are kept in {out}; run the same command again to resume"
     with user_errors(out, kept, MODEL_ERRORS), progress() as bars:
@@ -47,6 +47,7 @@ def make_dataset(
                 f"only {summary.total(split)} of {wanted} {split} tasks were admitted: see {out}/attempts.jsonl, "
                 "add scenes, or ask for fewer"
             )
+    return summary
 
 
 def _print_summary(summary: BuildSummary) -> None:

@@ -18,6 +18,7 @@ from embomatrix.factory.commands.terminal import check_output, counter, report_e
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
+from embomatrix.factory.evaluate.lies import evaluate_lies
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
@@ -39,7 +40,7 @@ def evaluate(
     parts: Annotated[
         list[str],
         typer.Argument(
-            help="Parts to measure: tasks, scenes, looks, admission, aesthetics. A .json file of figures is read instead."
+            help="Parts to measure: tasks, scenes, looks, admission, lies, aesthetics. A .json file of figures is read instead."
         ),
     ],
     dataset: Annotated[
@@ -75,7 +76,7 @@ def evaluate(
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
     ] = None,
 ) -> None:
-    """Measure parts of the factory: diversity of tasks, layouts of fixed tasks, admission of drafts, aesthetics.
+    """Measure parts of the factory: diversity of tasks, layouts of fixed tasks, admission, lies, aesthetics.
 
     A language model judges looks, and also tasks if one is given.
     """
@@ -85,6 +86,7 @@ def evaluate(
         "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes),
         "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
+        "lies": evaluate_lies,
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
     check_output(page)

@@ -13,8 +13,9 @@ from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pictures.sights import sights_of
-from embomatrix.factory.social.model_agents import SocialModelAgents
-from embomatrix.factory.social.model_writer import ModelWriter
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.social.model.agents import SocialModelAgents
+from embomatrix.factory.social.model.writer import ModelWriter
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.endpoint import Endpoint
@@ -99,13 +100,21 @@ def layout_agents(
 
 
 @contextlib.contextmanager
-def model_task_writer(
-    url: str, model: str, key: str, cassette: Path | None, *, price: Price, accounts: Path, look: bool
+def model_request_writer(
+    url: str,
+    model: str,
+    key: str,
+    cassette: Path | None,
+    *,
+    price: Price,
+    accounts: Path,
+    look: bool,
+    seed: int,
 ) -> Iterator[tuple[ModelWriter, Ledger]]:
-    """Yield a task writer on a language model, and the ledger of its costs.
+    """Yield a writer of requests on a language model, and the ledger of its costs.
 
-    ``accounts`` is the ledger's file. With ``look``, the model sees pictures of each scene. Raise EndpointError or
-    CassetteError.
+    ``accounts`` is the ledger's file. With ``look``, the model sees pictures of each base scene, built with ``seed``.
+    Raise EndpointError or CassetteError.
     """
     endpoint = _endpoint(url, model, key)
     if endpoint is None:
@@ -115,7 +124,11 @@ def model_task_writer(
         # The ledger sits behind the cassette: replayed answers cost nothing.
         ledger = Ledger(endpoint, price=price, path=accounts)
         chat = _recorded(ledger, cassette)
-    with ModelWriter(SocialModelAgents(chat), endpoint, sights_of if look else None) as writer:
+
+    def sights(base: str) -> tuple[bytes, ...]:
+        return sights_of(build_base_scene(base, seed=seed))
+
+    with ModelWriter(SocialModelAgents(chat), endpoint, sights if look else None) as writer:
         yield writer, ledger
 
 

@@ -19,7 +19,8 @@ from embomatrix.factory.social.telling import Asked, Teller, UndescribableError
 from embomatrix.factory.social.values import Cast
 from embomatrix.factory.social.wish import Condition, Quantity, goal_of
 from embomatrix.factory.task_import.reach import profile_for
-from embomatrix.factory.task_import.task_fields import category_of, signature_of, sources_for, taps_for
+from embomatrix.factory.task_import.task_fields import signature_of, sources_for, taps_for
+from embomatrix.factory.writer.categories import category_of
 from embomatrix.factory.writer.tasks import Draft, object_table
 from embomatrix.factory.writer.words import FreshVoice
 from embomatrix.skills.prompt import situation_of

@@ -50,6 +50,14 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "states. *shortcut_share* is the share of tasks with one, *relation_swaps* the number of placement tasks solved with "
         "another relation, *unfaithful_share* the share of tasks whose words and goal disagree.",
     ),
+    "lies": (
+        "Lying models",
+        "`embomatrix factory evaluate lies` runs the model writer on a scripted model that tells one lie of a table, again "
+        "and again. *lies_refused* is the share of lies of which no task comes, *lies_refused_by_rules* the share that the "
+        "rules refuse without the validation agent. *honest_admitted* is the share of honest requests that are admitted. Calls "
+        "and tokens are those of the honest requests, two in each dialogue, in the first dialogue of a home, without "
+        "corrections; tokens are words and punctuation marks.",
+    ),
     "aesthetics": (
         "Aesthetics",
         "`embomatrix factory evaluate aesthetics` computes a geometric score of 0 to 10. Its weights are fitted to give "

@@ -14,10 +14,12 @@ from embomatrix.factory.layout.agent_interfaces import AgentInterface, BriefErro
 from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
 from embomatrix.factory.social.fitting import reasons_for
-from embomatrix.factory.social.model_agents import SocialModelAgents
+from embomatrix.factory.social.model.agents import SocialModelAgents
+from embomatrix.factory.social.model.answers import Household
+from embomatrix.factory.social.model.dialogue import conversation_of, converse
+from embomatrix.factory.social.scene_kinds import SceneKinds, kinds_of
 from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
 from embomatrix.factory.social.writer import SocialWriter
@@ -81,24 +83,30 @@ def summarise(brief: SummaryBrief) -> RequestSummary:
 
 async def answer_with_model(agents: SocialModelAgents, name: SocialAgent, brief: Any) -> Any:
     """Answer a brief with a language model. Raise LlmError or CatalogError."""
-    if name in (SocialAgent.EXTRACTOR, SocialAgent.PLAYER):
-        scene = build_base_scene(brief.scene, seed=brief.seed)
-        facts = _facts(scene)
-        if name is SocialAgent.PLAYER:
-            cast = await agents.cast(facts, brief.seed)
-            return TalkBrief(scene=brief.scene, cast=cast, seed=brief.seed)
-        return with_sights(facts, (await agents.describe(facts, sights_of(scene), brief.seed)).rooms)
-    rng = _rng(brief.scene, brief.seed)
-    variant = _variant(brief.scene, brief.seed, rng)
-    view = SceneView(variant.scene)
-    facts = facts_of(view, variant.rooms)
+    scene = build_base_scene(brief.scene, seed=brief.seed)
+    kinds = kinds_of(SceneView(scene))
+    if name is SocialAgent.EXTRACTOR:
+        sight = await agents.describe(kinds, sights_of(scene), brief.seed)
+        return with_sights(_facts(scene), sight.rooms)
+    if name is SocialAgent.PLAYER:
+        household = await agents.people(kinds, brief.seed)
+        day = await agents.plan_day(kinds, household, (), brief.seed)
+        cast = household.cast(tuple(event.slot() for event in day))
+        return TalkBrief(scene=brief.scene, cast=cast, seed=brief.seed)
     if name is SocialAgent.SIMULATOR:
-        slot = starting_slots(brief.cast, variant.rooms, rng)[0]
-        conversation = await agents.converse(facts, brief.cast, slot, brief.category, brief.seed)
-        return SummaryBrief(scene=brief.scene, cast=brief.cast, conversation=conversation, seed=brief.seed)
-    request = await agents.summarise(facts, view, brief.conversation, brief.seed)
-    wishes = tuple(wish.model_dump_json() for wish in request.wishes)
-    return RequestSummary(instruction=request.instruction, wishes=wishes)
+        return await _talk(agents, kinds, brief)
+    summary = await agents.summarise(kinds, brief.conversation.turns, brief.seed)
+    wishes = tuple(request.wish.model_dump_json(exclude_defaults=True) for request in summary.requests)
+    return RequestSummary(instruction=summary.requests[0].instruction, wishes=wishes)
+
+
+async def _talk(agents: SocialModelAgents, kinds: SceneKinds, brief: TalkBrief) -> SummaryBrief:
+    """Return a conversation about the first event of a day that the model plans. Raise LlmError."""
+    household = Household(brief.cast.setting, brief.cast.people, dict.fromkeys(brief.cast.names, ()))
+    event = (await agents.plan_day(kinds, household, (), brief.seed))[0]
+    turns = await converse(agents, kinds, household, event, lambda number: brief.seed + number)
+    conversation = conversation_of(event, turns, (turns[-1].text,))
+    return SummaryBrief(scene=brief.scene, cast=brief.cast, conversation=conversation, seed=brief.seed)
 
 
 def _facts(scene: Scene) -> SceneFacts:

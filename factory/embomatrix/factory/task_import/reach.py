@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Iterator, Mapping
 from typing import Final
 
+from embomatrix.factory.writer.categories import REAL
 from embomatrix.world.bddl import BddlProblem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import (
@@ -36,7 +37,7 @@ from embomatrix.world.substances import (
 from embomatrix.world.task import Profile
 
 INSOURCE: Final = "insource"
-REAL, FUTURE = "real", "future"
+FUTURE: Final = "future"
 HELD: Final = frozenset((*Relation, *State, *SubstanceRelation, REAL, FUTURE))
 """Predicates that a scene can represent and a goal can use."""
 HOUSEHOLD: Final = frozenset((State.SLICED, *MEANINGS, *SubstanceRelation, REAL, FUTURE))

@@ -23,20 +23,19 @@ from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.models import models_for, with_sizes
 from embomatrix.factory.task_import.neighbours import neighbours_of
-from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
+from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, pieces_of, profile_for
 from embomatrix.factory.task_import.scene_changes import SceneChange, changes_of
 from embomatrix.factory.task_import.search import BindingOptions
 from embomatrix.factory.task_import.size_requirements import requirement_on, requirements_of
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.start_state import with_robot_in, with_states
 from embomatrix.factory.task_import.task_fields import (
-    SWITCHED,
-    category_of,
     instruction_of,
     signature_of,
     sources_for,
     taps_for,
 )
+from embomatrix.factory.writer.categories import REAL, SWITCHED, category_of
 from embomatrix.factory.writer.tasks import object_table
 from embomatrix.world.bddl import BddlProblem, InitLiteral, is_room_instance
 from embomatrix.world.catalog import Catalog, Model, share_of

@@ -1,4 +1,4 @@
-"""Fields of an imported task: instruction, category, signature, and appliances that the goal needs."""
+"""Fields of an imported task: instruction, signature, and appliances that the goal needs."""
 
 import itertools
 import re
@@ -7,19 +7,14 @@ from types import MappingProxyType
 from typing import Final
 
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.task_import.reach import REAL
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.skills.appliances import liquids_given
 from embomatrix.world.bddl import ROOM_TYPES, BddlProblem, is_room_instance
 from embomatrix.world.evaluate import atoms_of
 from embomatrix.world.goal import Formula
-from embomatrix.world.state import THERMAL, Relation, State, SubstanceRelation
-from embomatrix.world.substances import MEANINGS, WATER
-from embomatrix.world.task import TaskCategory
+from embomatrix.world.state import THERMAL, State
+from embomatrix.world.substances import WATER
 
-KITCHEN: Final = THERMAL | {State.SLICED, REAL}
-SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
-CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
 _ROOM_OR_TEXT: Final = re.compile(
     rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
     re.IGNORECASE,
@@ -42,19 +37,6 @@ def instruction_of(
     )
     words = re.sub(r"\s+([.,]|$)", r"\1", re.sub(r"\s+", " ", spaced)).strip(" .")
     return f"{words[:1].upper()}{words[1:]}."
-
-
-def category_of(goal: Formula) -> TaskCategory:
-    """Return the task category of a goal."""
-    predicates = {atom.predicate for atom in atoms_of(goal)}
-    moves = bool(predicates & set(Relation))
-    switches = bool(predicates & (SWITCHED | CLEANED))
-    if predicates & KITCHEN:
-        outside = {Relation.ONTOP, Relation.UNDER, Relation.NEXTTO, State.OPEN} & predicates
-        return TaskCategory.COMPOUND if outside else TaskCategory.KITCHEN_OPERATION
-    if moves and switches:
-        return TaskCategory.COMPOUND
-    return TaskCategory.APPLIANCE_USE if switches else TaskCategory.PICK_AND_PLACE
 
 
 def signature_of(goal: Formula, view: SceneView) -> str:

@@ -1,0 +1,345 @@
+"""Model writer: dialogues of several agents, bounded failures, and tasks about a variant's objects."""
+
+import asyncio
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from tests.fakes.chat_server import ChatServer
+
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
+from embomatrix.factory.commands.app import _print_account
+from embomatrix.factory.evaluate.lies import LieTable, ScriptedModel, ScriptedRequest
+from embomatrix.factory.faithfulness.instruction import audit
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.model.agents import DAY, PEOPLE, SIGHT, SUMMARY, TURN, SocialModelAgents
+from embomatrix.factory.social.model.drafts import VariantModelWriter
+from embomatrix.factory.social.model.writer import ModelWriter
+from embomatrix.factory.social.scene_kinds import kinds_of
+from embomatrix.factory.social.wish import Condition, Wish, WishedObjects, WishPredicate
+from embomatrix.factory.social.written import WrittenRequest
+from embomatrix.factory.writer.tasks import Draft, DraftOrder
+from embomatrix.factory.writer.variant import build_variant
+from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.llm.ledger import Ledger
+from embomatrix.llm.values import ChatRequest, EndpointError, Reply, UnusableReplyError, Usage
+from embomatrix.world.task import TaskCategory
+
+TABLE = LieTable.load()
+BASE = build_base_scene(TABLE.scene, seed=0)
+SCENE = kinds_of(SceneView(BASE))
+HONEST = {each.name: each for each in TABLE.honest}
+
+
+def scripted(*names: str) -> ScriptedModel:
+    return ScriptedModel(TABLE.people, [HONEST[name] for name in names])
+
+
+def written(
+    model: ScriptedModel, count: int = 1, earlier: Sequence[str] = ()
+) -> list[WrittenRequest | TaskRefusal]:
+    with ModelWriter(SocialModelAgents(model)) as writer:
+        return writer.write(SCENE, count, 3, earlier)
+
+
+def prompts(model: ScriptedModel, purpose: str) -> list[str]:
+    return [
+        "\n".join(message.text for message in each.messages)
+        for each in model.prompts
+        if each.purpose == purpose
+    ]
+
+
+def test_one_dialogue_gives_several_requests_with_their_conversation() -> None:
+    model = scripted("book", "oven")
+    found = written(model, 2)
+    assert [each.instruction for each in found if isinstance(each, WrittenRequest)] == [
+        HONEST["book"].instruction,
+        HONEST["oven"].instruction,
+    ]
+    first = found[0]
+    assert isinstance(first, WrittenRequest)
+    assert first.wish == HONEST["book"].wish
+    assert [turn.speaker for turn in first.conversation.turns] == ["Maya", "robot", "Jonas", "robot"]
+    assert first.signature == "ontop(hardback,coffee_table)"
+    assert "**Jonas** (answer)" in first.transcript()
+
+
+def test_each_turn_is_one_call_with_the_knowledge_of_its_speaker_alone() -> None:
+    model = scripted("book", "oven")
+    written(model, 2)
+    maya, robot, jonas, last = prompts(model, TURN)
+    event = "A thing that was left on the bed is needed"
+    other = "Something from the fridge would be good"
+    assert event in maya
+    assert other not in maya
+    assert other in jonas
+    assert event not in jonas
+    assert "reads on the sofa before bed" in maya
+    assert "bakes on Sundays" in jonas
+    for heard in (robot, last):
+        assert event not in heard
+        assert other not in heard
+        assert "Habit" not in heard
+        assert "wall cabinet" in heard
+    assert HONEST["book"].instruction in robot
+
+
+def test_no_prompt_names_an_object_of_the_scene() -> None:
+    model = scripted("book")
+    written(model)
+    names = [item.name for item in BASE.objects]
+    for prompt in (text for purpose in (PEOPLE, DAY, TURN, SUMMARY) for text in prompts(model, purpose)):
+        assert not [name for name in names if name in prompt]
+
+
+def test_day_planner_sees_earlier_tasks_and_those_just_written() -> None:
+    model = scripted("book")
+    written(model, 5, ["Jonas wants the window open."])
+    first, second, *_ = prompts(model, DAY)
+    assert "- Jonas wants the window open." in first
+    assert HONEST["book"].instruction not in first
+    assert f"- {HONEST['book'].instruction}" in second
+
+
+def test_people_are_invented_once_for_each_home() -> None:
+    model = scripted("book")
+    with ModelWriter(SocialModelAgents(model)) as writer:
+        writer.write(SCENE, 2, 0)
+        writer.write(SCENE, 2, 1)
+    assert len(prompts(model, PEOPLE)) == 1
+
+
+def test_equal_seeds_give_equal_questions_and_requests() -> None:
+    first, second = scripted("book", "oven"), scripted("book", "oven")
+    assert written(first, 4) == written(second, 4)
+    assert first.prompts == second.prompts
+    seeds = [each.seed for each in first.prompts]
+    assert len(set(seeds)) > len(seeds) // 2
+
+
+class _Slow(ScriptedModel):
+    """Model that answers turns slowly, and counts those in progress."""
+
+    now = 0
+    most = 0
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        self.now += 1
+        self.most = max(self.most, self.now)
+        await asyncio.sleep(0.01)
+        self.now -= 1
+        return await super().complete(request)
+
+
+def test_dialogues_are_held_concurrently() -> None:
+    model = _Slow(TABLE.people, [HONEST["book"]])
+    written(model, 4)
+    assert model.most == 2  # the scripted day has two events
+
+
+class _Garbage:
+    """Model that writes no JSON for these purposes, or for any."""
+
+    def __init__(self, model: ScriptedModel, *purposes: str) -> None:
+        self._model = model
+        self._purposes = purposes
+        self.calls = 0
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        self.calls += 1
+        if not self._purposes or request.purpose in self._purposes:
+            return Reply("Sure! Here is what you want.", "garbage-1", Usage(), "stop", 0.0)
+        return await self._model.complete(request)
+
+
+@pytest.mark.parametrize(("purposes", "most"), [((), 9), ((TURN,), 12), ((SUMMARY,), 30)])
+def test_garbage_ends_the_writing_after_a_bounded_number_of_calls(
+    purposes: tuple[str, ...], most: int
+) -> None:
+    model = _Garbage(scripted("book"), *purposes)
+    with (
+        ModelWriter(SocialModelAgents(model)) as writer,
+        pytest.raises(
+            UnusableReplyError, match="none usable, the last because it holds no complete JSON value"
+        ),
+    ):
+        writer.write(SCENE, 100, 0)
+    assert model.calls <= most
+
+
+def test_lies_without_end_are_refused_a_bounded_number_of_times() -> None:
+    lie = next(each for each in TABLE.lies if each.name == "polarity")
+    found = written(ScriptedModel(TABLE.people, [lie]), 2)
+    assert len(found) == 6
+    reasons = {each.reason if isinstance(each, TaskRefusal) else "" for each in found}
+    assert reasons == {RefusalReason.UNFAITHFUL}
+
+
+def test_dead_endpoint_ends_the_writing() -> None:
+    server = ChatServer((500, {}, "broken", 0.0))
+    limits = EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
+    with (
+        server.serving() as url,
+        ModelWriter(SocialModelAgents(Endpoint(url, "small-1", limits=limits))) as writer,
+        pytest.raises(EndpointError, match=r"role-playing agent: the endpoint .* answered 500"),
+    ):
+        writer.write(SCENE, 10, 0)
+    assert len(server.requests) == 6
+
+
+def test_schema_of_the_answer_is_on_the_wire_and_in_no_prompt() -> None:
+    server = ChatServer(json.dumps(TABLE.people), "no")
+    with (
+        server.serving() as url,
+        ModelWriter(SocialModelAgents(Endpoint(url, "small-1"))) as writer,
+        pytest.raises(UnusableReplyError),
+    ):
+        writer.write(SCENE, 10, 0)
+    for sent, name in zip(server.requests[:2], ("PeopleAnswer", "DayAnswer"), strict=True):
+        assert sent["response_format"]["json_schema"]["schema"]["title"] == name
+        assert not any('"properties"' in message["content"] for message in sent["messages"])
+
+
+class _Evasive(ScriptedModel):
+    """Model whose robot never confirms."""
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        reply = await super().complete(request)
+        return Reply(reply.text.replace("confirm", "propose"), reply.model, reply.usage, "stop", 0.0)
+
+
+def test_dialogue_without_confirmation_leads_to_no_request() -> None:
+    model = _Evasive(TABLE.people, [HONEST["book"]])
+    with (
+        ModelWriter(SocialModelAgents(model)) as writer,
+        pytest.raises(UnusableReplyError, match="the robot confirmed nothing in 6 turns"),
+    ):
+        writer.write(SCENE, 1, 0)
+    assert not prompts(model, SUMMARY)
+
+
+class _Seeing(ScriptedModel):
+    """Vision model: a sentence for each room that the pictures show."""
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        if request.purpose == SIGHT:
+            assert request.messages[1].images == (b"png of Rs_int",)
+            rooms = {room: f"A bright {room} with a low table." for room in SCENE.rooms}
+            return Reply(json.dumps({"rooms": rooms}), "seeing", Usage(), "stop", 0.0)
+        return await super().complete(request)
+
+
+def test_vision_model_describes_the_rooms_to_the_other_agents() -> None:
+    model = _Seeing(TABLE.people, [HONEST["book"]])
+    with ModelWriter(SocialModelAgents(model), look=lambda base: (f"png of {base}".encode(),)) as writer:
+        writer.write(SCENE, 1, 0)
+    assert all(
+        "A bright kitchen_0 with a low table." in text
+        for text in prompts(model, PEOPLE) + prompts(model, DAY)
+    )
+
+
+def test_everyday_names_of_kinds_and_rooms_are_understood() -> None:
+    book = HONEST["book"]
+    groups = [
+        group.model_copy(update={"room": group.room.replace("bedroom_0", "the bedroom"), "kind": kind})
+        for group, kind in zip(book.wish.objects, ("bed", "hardback book", "coffee table"), strict=True)
+    ]
+    told = ScriptedRequest(
+        "book",
+        "",
+        book.instruction,
+        Wish(objects=tuple(groups), conditions=book.wish.conditions),
+        book.demands,
+    )
+    found = written(ScriptedModel(TABLE.people, [told]))[0]
+    assert isinstance(found, WrittenRequest)
+    assert found.wish == book.wish
+
+
+# Drafts about a variant
+
+VARIANT = build_variant(
+    BASE, tuple(room.name for room in BASE.rooms), "Rs_int-model", np.random.default_rng(5)
+)
+VIEW = SceneView(VARIANT.scene)
+
+
+def a_thing() -> tuple[str, str]:
+    """Return a small object whose kind is unique in the variant, and its room."""
+    kinds = [VIEW.category(name) for name in VARIANT.added]
+    name = next(
+        each
+        for each in VARIANT.added
+        if kinds.count(VIEW.category(each)) == 1
+        and VIEW.takes("bed_1", each, inside=False)
+        and VIEW.item(each).host
+    )
+    return VIEW.category(name), name
+
+
+def draft(request: ScriptedRequest, category: TaskCategory) -> Draft | TaskRefusal | None:
+    with ModelWriter(SocialModelAgents(ScriptedModel(TABLE.people, [request]))) as writer:
+        order = DraftOrder(category, "t", np.random.default_rng(0))
+        return VariantModelWriter(writer).write(VARIANT, VIEW, order)
+
+
+def wish_for(kind: str, room: str) -> Wish:
+    bed = WishedObjects(label="bed", kind="bed", room="bedroom_0", furniture=True)
+    thing = WishedObjects(label="thing", kind=kind, room=room)
+    return Wish(
+        objects=(bed, thing),
+        conditions=(Condition(predicate=WishPredicate.ONTOP, things="thing", place="bed"),),
+    )
+
+
+def test_request_about_objects_of_a_variant_becomes_a_draft_of_the_goals_category() -> None:
+    kind, name = a_thing()
+    room = VIEW.room(name).rpartition("_")[0].replace("_", " ")
+    words = f"Please put the {kind.replace('_', ' ')} from the {room} on the bed."
+    request = ScriptedRequest("thing", "", words, wish_for(kind, VIEW.room(name)), None)
+    found = draft(request, TaskCategory.KITCHEN_OPERATION)
+    assert isinstance(found, Draft), found
+    assert found.task.goal_bddl == f"(ontop {name} bed_1)"
+    assert found.task.category is TaskCategory.PICK_AND_PLACE
+    assert {name, "bed_1"} <= set(found.task.table)
+    assert audit(found.task, found.intent, VIEW) == ()
+    assert words in found.transcript
+
+
+def test_request_about_objects_that_the_variant_lacks_is_refused() -> None:
+    request = ScriptedRequest(
+        "violin",
+        "",
+        "Please put the violin from the kitchen on the bed.",
+        wish_for("violin", "kitchen_0"),
+        None,
+    )
+    found = draft(request, TaskCategory.PICK_AND_PLACE)
+    assert isinstance(found, TaskRefusal)
+    assert found.reason is RefusalReason.NO_SCENE_OBJECT
+
+
+def test_build_summary_tells_calls_and_tokens_for_each_admitted_task(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    ledger = Ledger(scripted("book", "oven"))
+    with ModelWriter(SocialModelAgents(ledger)) as writer:
+        writer.write(SCENE, 2, 0)
+    _print_account(ledger, 2)
+    total = ledger.total()
+    tokens = (total.prompt_tokens + total.completion_tokens) / 2
+    assert (
+        f"{total.calls / 2:.1f} calls and {tokens:,.0f} tokens for each admitted task"
+        in capsys.readouterr().out
+    )
+
+
+def test_scene_description_is_short_and_counts_alike_furniture() -> None:
+    text = SCENE.listed()
+    assert "5 x top_cabinet" in text
+    assert "2 x pot_plant on coffee_table" in text
+    assert len(text) < 700
