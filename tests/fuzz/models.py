@@ -15,6 +15,7 @@ import trimesh
 from tests.fuzz.decoder import Decoder, in_file, mutate_bytes, mutate_json, mutate_json_lines, text_of
 from tests.fuzz.world import record_line
 
+from embomatrix.factory.days.agent_interfaces import SOCIAL_AGENTS
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.evaluate.faithfulness import read_answers
 from embomatrix.factory.evaluate.judges import DiversityScores, Impression
@@ -50,7 +51,6 @@ from embomatrix.factory.pipeline.store import (
     BuildStore,
     build_settings,
 )
-from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS
 from embomatrix.factory.social.model.answers import (
     DayAnswer,
     PeopleAnswer,

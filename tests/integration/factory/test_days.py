@@ -5,16 +5,14 @@ from __future__ import annotations
 import re
 import zlib
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from embomatrix.factory.days.drafts import DraftWriter, combinations_of
-from embomatrix.factory.days.laying import DayScene, lay_out
+from embomatrix.factory.days.laying import LaidOut, lay_out
 from embomatrix.factory.days.maker import DAYS, DayMaker
-from embomatrix.factory.days.planning import need_weights
+from embomatrix.factory.days.planning import PlannedDay, need_weights, plan_day
 from embomatrix.factory.language.kinds import is_held_out
 from embomatrix.factory.pipeline.build import build_dataset, split_scenes
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
@@ -27,7 +25,6 @@ from embomatrix.factory.social.knowledge import Need, events
 from embomatrix.factory.social.values import Cast
 from embomatrix.factory.social.wish import problem_of
 from embomatrix.factory.writer.tasks import Draft
-from embomatrix.factory.writer.words import FreshVoice
 from embomatrix.world.bddl import parse_problem, render_problem
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.evaluate import ground_size
@@ -48,16 +45,12 @@ def people(base: Scene, split: str = "train") -> tuple[Cast, np.random.Generator
     return draw_cast(base.base, [room.name for room in base.rooms], rng, split, 0), rng
 
 
-def drafts(base: Scene, split: str = "train") -> Iterator[tuple[Draft, tuple[NeedOfDay, ...]]]:
-    cast, rng = people(base, split)
-    needs = draw_needs(SceneView(base), cast, 6, 3, rng, {})
-    day = lay_out("day", needs, base, rng)
-    assert isinstance(day, DayScene)
-    writer = DraftWriter(day, cast, split, 0, FreshVoice(rng, Counter()))
-    for number, combination in enumerate(combinations_of(day, rng)):
-        draft = writer.draft(f"task-{number}", combination)
-        if draft is not None:
-            yield draft, combination.needs
+def drafts(base: Scene, split: str = "train") -> tuple[Draft, ...]:
+    rooms = tuple(room.name for room in base.rooms)
+    order = VariantOrder(split, 1, base.base, rooms, dict.fromkeys(TaskCategory, 1), frozenset())
+    planned = plan_day(order, base, 0)
+    assert isinstance(planned, PlannedDay)
+    return planned.drafts
 
 
 def needs_by_name() -> dict[str, Need]:
@@ -99,14 +92,13 @@ def test_needs_come_from_the_people_of_the_place(bases: dict[str, Scene]) -> Non
 def test_instructions_name_a_person_and_no_object_by_its_name_in_the_scene(bases: dict[str, Scene]) -> None:
     seen = 0
     for base in bases.values():
-        cast, _ = people(base)
-        for draft, _ in drafts(base):
+        for draft in drafts(base):
             text = draft.task.instruction
             assert not LONG.search(text), text
             assert text[0].isupper()
             assert draft.task.goal_objects <= set(draft.task.table)
             assert 1 <= ground_size(draft.task.goal, draft.task.types) <= 40
-            assert any(name in draft.transcript for name in cast.names)
+            assert "## The people" in draft.transcript
             seen += 1
     assert seen >= 6
 
@@ -120,8 +112,10 @@ def test_a_thing_that_the_scene_lacks_is_laid_out_for_its_wish(bases: dict[str, 
     wished = wish_of(need, view, rng)
     assert wished is not None
     event = next(event for event in events() if event.name == "a yoga class")
-    day = lay_out("yoga", [NeedOfDay(event, cast.people[0], "nine o'clock", need, *wished)], base, rng)
-    assert isinstance(day, DayScene)
+    asked = NeedOfDay(event, cast.people[0], "09:30", need, *wished)
+    assert asked.time == "half past nine"
+    day = lay_out("yoga", [asked.wish], base, rng)
+    assert isinstance(day, LaidOut)
     mats = day.members[0]["mats"]
     assert len(mats) >= 3
     assert not any(name in base.by_name for name in mats)

@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.commands.agents import ALL_AGENTS
 from embomatrix.factory.commands.app import app
+from embomatrix.factory.days.agent_interfaces import SOCIAL_AGENTS, SocialAgent
 from embomatrix.factory.evaluate.lies import LieTable
 from embomatrix.factory.layout.agent_interfaces import AgentName
-from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent
 from embomatrix.factory.social.values import SummaryBrief, TalkBrief
 
 BRIEF = '{"scene": "Rs_int", "seed": 1}'

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from embomatrix.factory.days.maker import DAYS
 from embomatrix.factory.evaluate.faithfulness import PolicyAnswers, audit_dataset, evaluation_of
 from embomatrix.factory.pipeline.build import build_dataset
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
@@ -48,7 +49,9 @@ def hunt_shortcuts(sizes: HuntSizes, on_step: Callable[[str], None]) -> tuple[Fi
         with tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name:
             folder = Path(name)
             on_step(f"tasks of the {writer} writer")
-            summary = build_dataset(folder, settings, jobs=jobs)
+            summary = build_dataset(
+                folder, settings, jobs=jobs, making=DAYS if writer is WriterKind.SOCIAL else None
+            )
             refused += summary.rejected.get("shortcut", 0) + summary.rejected.get("unfaithful", 0)
             records = Dataset.load(folder).records
             scenes = Counter(base_scene_of(record.task.scene_id) for record in records)

@@ -19,8 +19,8 @@ from embomatrix.factory.commands.language_model import (
     model_layout_agents,
 )
 from embomatrix.factory.commands.terminal import fail, say, user_errors
+from embomatrix.factory.days.agent_interfaces import SOCIAL_AGENTS, SocialAgent, answer_with_model
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, MODEL_BACKED, AgentInterface, AgentName
-from embomatrix.factory.social.agent_interfaces import SOCIAL_AGENTS, SocialAgent, answer_with_model
 from embomatrix.factory.social.model.agents import SocialModelAgents
 
 ALL_AGENTS: Final[Mapping[str, AgentInterface]] = {

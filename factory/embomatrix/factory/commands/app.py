@@ -2,6 +2,7 @@
 
 import contextlib
 from dataclasses import astuple
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -31,11 +32,13 @@ from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scene
 from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
 from embomatrix.factory.commands.verification import verify
+from embomatrix.factory.days.maker import DAYS, days_planned_by
+from embomatrix.factory.days.model_days import ModelDays
+from embomatrix.factory.days.planning import plan_day
 from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
-from embomatrix.factory.social.model.drafts import VariantModelWriter
 from embomatrix.host.commands import command_group
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
@@ -150,7 +153,8 @@ def generate(
             check = stack.enter_context(cluster_check(manager, token, trusted))
         layout = stack.enter_context(layout_agents(model_backed, llm, model, key, cassette, FailureLimit()))
         if kind is WriterKind.SOCIAL:
-            make_dataset(out, settings, jobs=jobs, check=check, layout=layout)
+            making = DAYS if layout is None else days_planned_by(partial(plan_day, agents=layout))
+            make_dataset(out, settings, jobs=jobs if layout is None else 1, check=check, making=making)
             return
         writer, ledger = stack.enter_context(
             model_request_writer(
@@ -164,7 +168,8 @@ def generate(
                 seed=seed,
             )
         )
-        summary = make_dataset(out, settings, VariantModelWriter(writer), check=check, layout=layout)
+        making = days_planned_by(ModelDays(writer, layout).plan)
+        summary = make_dataset(out, settings, jobs=1, check=check, making=making)
         _print_account(ledger, sum(map(summary.total, ("train", "heldout"))))
 
 

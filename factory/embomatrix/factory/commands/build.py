@@ -5,10 +5,9 @@ from pathlib import Path
 from embomatrix.factory.commands.language_model import MODEL_ERRORS
 from embomatrix.factory.commands.options import processes
 from embomatrix.factory.commands.terminal import fail, progress, say, show_table, user_errors
-from embomatrix.factory.days.maker import DAYS
 from embomatrix.factory.layout.request import LayoutAgents
-from embomatrix.factory.pipeline.build import BuildSummary, VariantCheck, build_dataset
-from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.factory.pipeline.build import BuildSummary, Making, VariantCheck, build_dataset
+from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.world.task import TaskCategory
 
@@ -20,9 +19,9 @@ def make_dataset(
     jobs: int | None = None,
     check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
+    making: Making | None = None,
 ) -> BuildSummary:
     """Build the dataset with progress bars, print a summary and return it. Exit if it has too few tasks."""
-    making = DAYS if settings.writer is WriterKind.SOCIAL else None
     kept = f": finished tasks are kept in {out}; run the same command again to resume"
     with user_errors(out, kept, MODEL_ERRORS), progress() as bars:
         tasks = {

@@ -8,6 +8,7 @@ import typer
 from embomatrix.factory.commands.build import make_dataset
 from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Seed, in_physics
 from embomatrix.factory.commands.terminal import say, user_errors
+from embomatrix.factory.days.maker import DAYS
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
 
 
@@ -46,7 +47,7 @@ def corpus(
                 in_physics(physical, look_ahead=look_ahead),
             )
             for name, build in settings.builds().items():
-                make_dataset(out / name, build, jobs=jobs)
+                make_dataset(out / name, build, jobs=jobs, making=DAYS)
             frozen = freeze(out)
     say(
         f"Internal-Verified: {frozen.tasks} tasks, {frozen.unseen} in scenes that training never sees, {frozen.digest}"

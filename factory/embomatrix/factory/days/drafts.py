@@ -8,15 +8,15 @@ from typing import Final
 
 import numpy as np
 
-from embomatrix.factory.days.laying import SOURCE, DayScene
+from embomatrix.factory.days.laying import SOURCE
 from embomatrix.factory.faithfulness.clauses import goal_clauses
 from embomatrix.factory.language.clauses import PhraseBook
 from embomatrix.factory.language.references import Describer
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.day import NeedOfDay
-from embomatrix.factory.social.dialogue import conversation, transcript_of
+from embomatrix.factory.social.dialogue import converse, transcript_of
 from embomatrix.factory.social.telling import Asked, Teller, UndescribableError
-from embomatrix.factory.social.values import Cast
+from embomatrix.factory.social.values import Cast, Conversation
 from embomatrix.factory.social.wish import Condition, Quantity, goal_of
 from embomatrix.factory.task_import.reach import profile_for
 from embomatrix.factory.task_import.task_fields import signature_of, sources_for, taps_for
@@ -25,6 +25,7 @@ from embomatrix.factory.writer.tasks import Draft, object_table
 from embomatrix.factory.writer.words import FreshVoice
 from embomatrix.skills.prompt import situation_of
 from embomatrix.world.evaluate import render, types_of
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
 Members = Mapping[str, tuple[str, ...]]
@@ -32,6 +33,23 @@ NEEDS_OF_TASK: Final = (1, 1, 1, 2, 2, 3)
 """Numbers of needs that one task joins; each entry is equally likely."""
 MAX_ROWS: Final = 40
 """Maximum number of rows of a table, so that a person can read the prompt."""
+
+
+@dataclass(frozen=True, slots=True)
+class DayScene:
+    """Scene of a day with its needs, and the scene names of each need's objects by label."""
+
+    scene: Scene
+    needs: tuple[NeedOfDay, ...]
+    members: tuple[Members, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTask:
+    """Draft with the conversation behind it."""
+
+    draft: Draft
+    conversation: Conversation
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +87,13 @@ class DraftWriter:
         self._voice = voice
         self._book = PhraseBook(split, seed)
 
-    def draft(self, task_id: str, combination: Combination) -> Draft | None:
+    def draft(self, task_id: str, combination: Combination) -> PlannedTask | None:
         """Return the draft of a task; None if its objects can't be told apart.
 
         Words that fit several equal pieces of furniture mean any of them, and so does the goal.
         """
         conditions, members, about = self._joined(combination)
-        task = self._task(task_id, conditions, members, about)
+        task = task_of(task_id, self._view, conditions, members, about)
         while (unclear := self._unclear(task, members)) is not None:
             alike = self._alike(members[unclear])
             if len(alike) == len(members[unclear]):
@@ -84,21 +102,22 @@ class DraftWriter:
             members = {label: alike if each == names else each for label, each in members.items()}
             conditions = [_of_any(each) if members[each.things] == alike else each for each in conditions]
             about = tuple(dict.fromkeys((*about, *alike)))
-            task = self._task(task_id, conditions, members, about)
+            task = task_of(task_id, self._view, conditions, members, about)
         if len(task.table) > MAX_ROWS:
             return None
         told = self._told(task, combination, conditions, members)
         if told is None:
             return None
-        instruction, transcript = told
-        return Draft(
+        instruction, talk = told
+        draft = Draft(
             task=replace(task, instruction=instruction),
             about=task.table,
             rooms=tuple(sorted({self._view.room(name) for names in members.values() for name in names})),
             signature=signature_of(task.goal, self._view),
             intent=goal_clauses(task.goal, task.types),
-            transcript=transcript,
+            transcript=transcript_of(self._cast, combination.needs[0], talk, instruction, task.goal_bddl),
         )
+        return PlannedTask(draft, talk)
 
     def _joined(
         self, combination: Combination
@@ -116,30 +135,6 @@ class DraftWriter:
             name for need in combination.members for names in need.values() for name in names
         )
         return conditions, members, tuple(about)
-
-    def _task(
-        self, task_id: str, conditions: Sequence[Condition], members: Members, about: tuple[str, ...]
-    ) -> Task:
-        types = self._types(conditions, members)
-        goal = goal_of(conditions, members, types)
-        used = {types[label]: members[label] for label in types if types[label] in types_of(goal)}
-        known = tuple(dict.fromkeys(name for names in members.values() for name in names))
-        taps = taps_for(self._view, goal, about)
-        needed = dict.fromkeys((*about, *sources_for(self._view, goal, used, known), *taps))
-        return Task(
-            task_id=task_id,
-            scene_id=self._view.scene.scene_id,
-            instruction="",
-            category=category_of(goal),
-            goal=goal,
-            goal_bddl=render(goal),
-            table=object_table(
-                self._view, tuple(needed), np.random.default_rng(_seed_of(task_id)), elsewhere=True
-            ),
-            types=used,
-            source=SOURCE,
-            profile=profile_for(goal),
-        )
 
     def _unclear(self, task: Task, members: Members) -> str | None:
         """Return the label of objects that no description distinguishes from other rows."""
@@ -166,7 +161,7 @@ class DraftWriter:
 
     def _told(
         self, task: Task, combination: Combination, conditions: Sequence[Condition], members: Members
-    ) -> tuple[str, str] | None:
+    ) -> tuple[str, Conversation] | None:
         """Return the instruction and the conversation behind it; None if the objects can't be told apart."""
         teller = Teller(self._describer(task, members), self._book, self._voice)
         asked = []
@@ -179,23 +174,49 @@ class DraftWriter:
             asked.append(Asked(need, {**names, **changed}, own))
         try:
             instruction = teller.instruction(asked)
-            turns = conversation(asked, teller, self._voice)
+            return instruction, converse(
+                asked, teller, self._voice, self._view.room(next(iter(task.goal_objects)))
+            )
         except UndescribableError:
             return None
-        return instruction, transcript_of(self._cast, asked, turns, instruction, task.goal_bddl)
 
-    def _types(self, conditions: Sequence[Condition], members: Members) -> dict[str, str]:
-        """Return a type for each group that a quantifier ranges over. Groups whose type is taken are written out."""
-        types: dict[str, str] = {}
-        for condition in conditions:
-            for label in (condition.things, condition.place):
-                if not label or (len(members[label]) < 2 and condition.quantity is not Quantity.PAIRED):
-                    continue
-                synset = self._view.asset(members[label][0]).synset
-                taken = {members[other] for other, known in types.items() if known == synset}
-                if not taken or taken == {members[label]}:
-                    types[label] = synset
-        return types
+
+def task_of(
+    task_id: str, view: SceneView, conditions: Sequence[Condition], members: Members, about: Sequence[str]
+) -> Task:
+    """Return the task of these conditions, without its instruction. ``about`` are all objects that its wishes name."""
+    types = _types(view, conditions, members)
+    goal = goal_of(conditions, members, types)
+    used = {types[label]: members[label] for label in types if types[label] in types_of(goal)}
+    known = tuple(dict.fromkeys(name for names in members.values() for name in names))
+    needed = dict.fromkeys((*about, *sources_for(view, goal, used, known), *taps_for(view, goal, about)))
+    rng = np.random.default_rng(list(task_id.encode()))
+    return Task(
+        task_id=task_id,
+        scene_id=view.scene.scene_id,
+        instruction="",
+        category=category_of(goal),
+        goal=goal,
+        goal_bddl=render(goal),
+        table=object_table(view, tuple(needed), rng, elsewhere=True),
+        types=used,
+        source=SOURCE,
+        profile=profile_for(goal),
+    )
+
+
+def _types(view: SceneView, conditions: Sequence[Condition], members: Members) -> dict[str, str]:
+    """Return a type for each group that a quantifier ranges over. Groups whose type is taken are written out."""
+    types: dict[str, str] = {}
+    for condition in conditions:
+        for label in (condition.things, condition.place):
+            if not label or (len(members[label]) < 2 and condition.quantity is not Quantity.PAIRED):
+                continue
+            synset = view.asset(members[label][0]).synset
+            taken = {members[other] for other, known in types.items() if known == synset}
+            if not taken or taken == {members[label]}:
+                types[label] = synset
+    return types
 
 
 def _of_any(condition: Condition) -> Condition:
@@ -215,7 +236,3 @@ def _renamed(condition: Condition, labels: Mapping[str, str]) -> Condition:
             "otherwise": condition.otherwise and _renamed(condition.otherwise, labels),
         }
     )
-
-
-def _seed_of(task_id: str) -> list[int]:
-    return list(task_id.encode())

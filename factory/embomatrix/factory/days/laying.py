@@ -1,66 +1,66 @@
-"""Scene for the needs of a day: their wishes become one BDDL problem, for which the base scene is furnished."""
+"""Scene for the wishes of a day: they become one BDDL problem, for which the base scene is furnished."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.admission import TaskRefusal
-from embomatrix.factory.social.day import NeedOfDay
+from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.social.wish import Wish, problem_of
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import import_problem
+from embomatrix.factory.task_import.task import ImportOptions, import_problem
 from embomatrix.world.bddl import render_problem
 from embomatrix.world.scene import Scene
 
 SOURCE: Final = "society"
 """Source of the tasks of a simulated society."""
 MAX_LAYOUTS: Final = 6
-"""Maximum number of layouts tried for a day. After each failure, the need drawn last but one goes."""
+"""Maximum number of layouts tried for a day. After each failure, one wish goes."""
 SEEDS: Final = 2**31
 
 
 @dataclass(frozen=True, slots=True)
-class DayScene:
-    """Scene laid out for the needs of a day, with the scene names of each need's objects by label."""
+class LaidOut:
+    """Scene laid out for wishes. ``kept`` are the positions of the wishes that found their place.
+
+    ``members`` are the scene names of each kept wish's objects by label.
+    """
 
     scene: Scene
-    needs: tuple[NeedOfDay, ...]
+    kept: tuple[int, ...]
     members: tuple[Mapping[str, tuple[str, ...]], ...]
     notes: tuple[str, ...] = ()
 
 
 def lay_out(
-    name: str, needs: Sequence[NeedOfDay], base: Scene, rng: np.random.Generator
-) -> DayScene | TaskRefusal:
-    """Lay out the base scene for all needs, or for as many as find their place. A refusal is that of the last layout."""
-    left = list(needs)
-    refusal: TaskRefusal | None = None
-    for _ in range(MAX_LAYOUTS):
-        problem, labels = problem_of(name, [need.wish for need in left])
+    name: str,
+    wishes: Sequence[Wish],
+    base: Scene,
+    rng: np.random.Generator,
+    agents: LayoutAgents | None = None,
+) -> LaidOut | TaskRefusal:
+    """Lay out the base scene for all wishes, or for as many as find their place. A refusal is that of the last layout."""
+    options = ImportOptions(lay=partial(lay, agents=agents))
+    kept = list(range(len(wishes)))
+    while True:
+        problem, labels = problem_of(name, [wishes[at] for at in kept])
         source = SourceText(name, render_problem(problem), SOURCE)
-        imported = import_problem(source, base, seed=int(rng.integers(SEEDS)))
+        imported = import_problem(source, base, seed=int(rng.integers(SEEDS)), options=options)
         if not isinstance(imported, TaskRefusal):
             there = dict(zip(imported.instances, imported.about, strict=True))
-            members = tuple(
-                {
-                    label: tuple(there[each] for each in names if each in there)
-                    for label, names in group.items()
-                }
-                for group in labels
-            )
-            return DayScene(imported.scene, tuple(left), members, imported.notes)
-        refusal = imported
-        if len(left) == 1:
-            break
-        del left[int(rng.integers(len(left)))]
-    assert refusal is not None
-    return refusal
+            members = tuple(_found(group, there) for group in labels)
+            return LaidOut(imported.scene, tuple(kept), members, imported.notes)
+        if len(kept) == 1 or len(kept) <= len(wishes) - MAX_LAYOUTS:
+            return imported
+        del kept[int(rng.integers(len(kept)))]
 
 
-def wishes_of(day: DayScene) -> tuple[Wish, ...]:
-    """Return the wishes of a day in order."""
-    return tuple(need.wish for need in day.needs)
+def _found(group: Mapping[str, tuple[str, ...]], there: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """Return the scene objects of each label. Floors that no goal is about are no objects."""
+    return {label: tuple(there[each] for each in names if each in there) for label, names in group.items()}

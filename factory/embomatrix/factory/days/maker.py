@@ -6,10 +6,11 @@ import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
-from embomatrix.factory.days.planning import PlannedDay, day_name, plan_day
+from embomatrix.factory.days.planning import PlanDay, PlannedDay, day_name, plan_day
 from embomatrix.factory.faithfulness.shortcuts import find_shortcuts, shortcut_in_words
 from embomatrix.factory.pipeline.build import Making
 from embomatrix.factory.pipeline.settings import BuildSettings
@@ -37,10 +38,14 @@ from embomatrix.world.scene import Scene
 
 
 class DayMaker:
-    """Maker of days in this process. A result depends only on the settings and the order. Close the maker after use."""
+    """Maker of days in this process. A result depends only on the settings and the order. Close the maker after use.
 
-    def __init__(self, settings: BuildSettings) -> None:
+    ``plan`` replaces the rule-based planner of days.
+    """
+
+    def __init__(self, settings: BuildSettings, plan: PlanDay = plan_day) -> None:
         self._settings = settings
+        self._plan = plan
         self._library = PlacementLibrary()
         self._foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._bases: dict[str, Scene] = {}
@@ -50,7 +55,7 @@ class DayMaker:
         began = time.process_time()
         if order.base not in self._bases:
             self._bases[order.base] = build_base_scene(order.base, seed=self._settings.seed)
-        planned = plan_day(order, self._bases[order.base], self._settings.seed)
+        planned = self._plan(order, self._bases[order.base], self._settings.seed)
         work = _DayWork(order, self._settings, self._library, self._foresight)
         made = work.refused(planned) if isinstance(planned, TaskRefusal) else work.run(planned)
         return replace(made, cpu_s=time.process_time() - began)
@@ -61,6 +66,11 @@ class DayMaker:
 
 DAYS: Final = Making(DayMaker, whole_scenes=True)
 """Making of days in whole scenes."""
+
+
+def days_planned_by(plan: PlanDay) -> Making:
+    """Return a making of days with another planner. Equal planners give equal days."""
+    return Making(partial(DayMaker, plan=plan), whole_scenes=True)
 
 
 class _DayWork:

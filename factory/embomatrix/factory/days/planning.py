@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
-from embomatrix.factory.days.drafts import Combination, DraftWriter, combinations_of
+from embomatrix.factory.days.drafts import Combination, DayScene, DraftWriter, PlannedTask, combinations_of
 from embomatrix.factory.days.laying import lay_out
 from embomatrix.factory.language.kinds import is_held_out
+from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.variants import VariantOrder, uniqueness_key
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.day import draw_needs
@@ -38,11 +39,19 @@ FAVOUR: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class PlannedDay:
-    """Scene of a day with the drafts of its tasks, and refusals of needs that could not become a draft."""
+    """Scene of a day with its tasks, and refusals of needs that could not become a draft."""
 
     scene: Scene
-    drafts: tuple[Draft, ...]
+    tasks: tuple[PlannedTask, ...]
     refusals: tuple[TaskRefusal, ...]
+
+    @property
+    def drafts(self) -> tuple[Draft, ...]:
+        return tuple(each.draft for each in self.tasks)
+
+
+PlanDay = Callable[[VariantOrder, Scene, int], PlannedDay | TaskRefusal]
+"""Planner of a day from its order, the base scene and the seed of the build."""
 
 
 def people_of(order: VariantOrder, seed: int) -> Cast:
@@ -52,37 +61,44 @@ def people_of(order: VariantOrder, seed: int) -> Cast:
     return draw_cast(order.base, order.rooms, rng, order.split, seed)
 
 
-def plan_day(order: VariantOrder, base: Scene, seed: int) -> PlannedDay | TaskRefusal:
+def plan_day(
+    order: VariantOrder,
+    base: Scene,
+    seed: int,
+    agents: LayoutAgents | None = None,
+    cast: Cast | None = None,
+) -> PlannedDay | TaskRefusal:
     """Draw the needs of a day, lay out its scene and write its drafts. Equal arguments give equal days."""
     rng = np.random.default_rng(
         np.random.SeedSequence((seed, zlib.crc32(order.split.encode()), order.number))
     )
-    cast = people_of(order, seed)
+    cast = cast or people_of(order, seed)
     weights = need_weights(order.split, seed, order.missing)
     needs = draw_needs(SceneView(base), cast, NEEDS_OF_DAY, NEEDS_OF_EVENT, rng, weights)
     if not needs:
         return TaskRefusal(
             RefusalReason.NO_SCENE_OBJECT, "no event of the table suits the people and rooms of this place"
         )
-    day = lay_out(day_name(order), needs, base, rng)
-    if isinstance(day, TaskRefusal):
-        return day
+    laid = lay_out(day_name(order), [need.wish for need in needs], base, rng, agents)
+    if isinstance(laid, TaskRefusal):
+        return laid
+    day = DayScene(laid.scene, tuple(needs[at] for at in laid.kept), laid.members)
     writer = DraftWriter(day, cast, order.split, seed, FreshVoice(rng, Counter()))
-    drafts: list[Draft] = []
+    tasks: list[PlannedTask] = []
     refusals: list[TaskRefusal] = []
     known = set(order.known)
     for number, combination in enumerate(combinations_of(day, rng)):
         if order.split == "train" and is_held_out_shape(combination, seed):
             continue
-        draft = writer.draft(f"{day_name(order)}-{number:02d}", combination)
-        if draft is None:
+        planned = writer.draft(f"{day_name(order)}-{number:02d}", combination)
+        if planned is None:
             kinds = ", ".join(need.need.name for need in combination.needs)
             reason = f"no description distinguishes the objects of {kinds} from others in the table"
             refusals.append(TaskRefusal(RefusalReason.UNFAITHFUL, reason))
-        elif (key := uniqueness_key(draft.signature, draft.task.instruction)) not in known:
+        elif (key := uniqueness_key(planned.draft.signature, planned.draft.task.instruction)) not in known:
             known.add(key)
-            drafts.append(draft)
-    return PlannedDay(day.scene, tuple(drafts), tuple(refusals))
+            tasks.append(planned)
+    return PlannedDay(day.scene, tuple(tasks), tuple(refusals))
 
 
 def day_name(order: VariantOrder) -> str:

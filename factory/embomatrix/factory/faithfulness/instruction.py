@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Final
 
 from embomatrix.factory.faithfulness.clauses import goal_clauses
-from embomatrix.factory.language.nouns import noun_of
+from embomatrix.factory.language.nouns import everyday_noun
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.words import spoken
 from embomatrix.world.intent import IntentClause
@@ -88,7 +88,7 @@ def _of_clause(
 
 def nouns_of(category: str) -> tuple[str, ...]:
     """Return the nouns for a category."""
-    return tuple(dict.fromkeys((spoken(category).lower(), noun_of(category).one.lower())))
+    return tuple(dict.fromkeys((spoken(category).lower(), everyday_noun(category).lower())))
 
 
 def _is_mentioned(text: str, noun: str) -> bool:

@@ -79,6 +79,11 @@ def noun_of(category: str) -> Noun:
     return noun(EVERYDAY.get(category, category.replace("_", " ")))
 
 
+def everyday_noun(category: str) -> str:
+    """Return the everyday noun of a category in the singular."""
+    return noun_of(category).one
+
+
 @functools.cache
 def noun(words: str) -> Noun:
     """Return the noun with its plural. The head stands before a preposition: ``TVs on the wall``."""

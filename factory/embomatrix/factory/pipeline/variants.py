@@ -15,13 +15,12 @@ from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
 from embomatrix.factory.faithfulness.instruction import audit
 from embomatrix.factory.faithfulness.shortcuts import find_shortcuts, shortcut_in_words
 from embomatrix.factory.layout.request import LayoutAgents
-from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.store import Rejection, VariantResult, VariantYield
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.feasibility import SimulatedRobot
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import (
     BatchTaskWriter,
     Draft,
@@ -87,7 +86,7 @@ class VariantMaker:
         layout: LayoutAgents | None = None,
     ) -> None:
         if writer is None:
-            writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
+            writer = PlainWriter()
         self.settings = settings
         self.writer = writer
         self.library = PlacementLibrary()

@@ -41,14 +41,24 @@ FITTING_EVENT_WEIGHT: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class NeedOfDay:
-    """Need of a person on this day, with its wish. ``count`` is the number k of the need; 0 if it has none."""
+    """Need of a person on this day, with its wish. ``count`` is the number k of the need; 0 if it has none.
+
+    ``clock`` is the hour, such as 18:30.
+    """
 
     event: Event
     person: Person
-    time: str
+    clock: str
     need: Need
     wish: Wish
     count: int
+
+    @property
+    def time(self) -> str:
+        """Hour in words: *half past six*."""
+        hour, minute = map(int, self.clock.split(":"))
+        word = number_word((hour - 1) % 12 + 1)
+        return f"half past {word}" if minute else f"{word} o'clock"
 
 
 def events_for(base: str, cast: Cast) -> list[tuple[Event, Person, int]]:
@@ -87,7 +97,7 @@ def draw_needs(
         event, person, _ = candidates[int(rng.choice(len(candidates), p=likely / likely.sum()))]
         candidates = [item for item in candidates if item[0] is not event]
         low, high = event.hours
-        time = _clock(int(rng.integers(low, high + 1)), half=bool(rng.random() < 0.4))
+        clock = f"{int(rng.integers(low, high + 1)):02d}:{'30' if rng.random() < 0.4 else '00'}"
         order = _drawn_order(event.needs, weights, rng)
         left = min(each_event, most - len(agenda.needs))
         for need in order:
@@ -95,7 +105,7 @@ def draw_needs(
             if wished is None:
                 continue
             told = need if len(wished[0].conditions) == len(need.goal) else replace(need, say=())
-            if agenda.add(NeedOfDay(event, person, time, told, *wished)):
+            if agenda.add(NeedOfDay(event, person, clock, told, *wished)):
                 left -= 1
     return agenda.needs
 
@@ -104,14 +114,6 @@ def _drawn_order(needs: Sequence[Need], weights: Mapping[str, float], rng: np.ra
     """Return the needs in random order, those with larger weights earlier."""
     keys = [rng.random() ** (1 / max(weights.get(need.name, 1.0), 1e-3)) for need in needs]
     return [need for _, need in sorted(zip(keys, needs, strict=True), key=lambda pair: -pair[0])]
-
-
-def _clock(hour: int, *, half: bool) -> str:
-    return (
-        f"half past {number_word((hour - 1) % 12 + 1)}"
-        if half
-        else f"{number_word((hour - 1) % 12 + 1)} o'clock"
-    )
 
 
 def wish_of(need: Need, view: SceneView, rng: np.random.Generator) -> tuple[Wish, int] | None:

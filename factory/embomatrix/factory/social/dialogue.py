@@ -7,25 +7,28 @@ from typing import Final
 
 from embomatrix.factory.language.clauses import capitalised
 from embomatrix.factory.language.nouns import listed, noun_of, number_word
+from embomatrix.factory.social.day import NeedOfDay
 from embomatrix.factory.social.knowledge import people_table
 from embomatrix.factory.social.telling import Asked, Teller
-from embomatrix.factory.social.values import ROBOT, Act, Cast, DialogueTurn
+from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, DialogueTurn
 from embomatrix.factory.writer.words import Voice
 
 REFUSED_SHARE: Final = 0.6
 """Share of conversations with a chore that the robot refuses."""
 
 
-def conversation(asked: Sequence[Asked], teller: Teller, voice: Voice) -> tuple[DialogueTurn, ...]:
-    """Return the turns of a conversation about the needs of one event. Raise UndescribableError."""
-    talk = _Talk(teller, voice, asked[0].need.person.name)
+def converse(asked: Sequence[Asked], teller: Teller, voice: Voice, room: str) -> Conversation:
+    """Return the conversation about the needs of one event in this room. Raise UndescribableError."""
+    first = asked[0].need
+    talk = _Talk(teller, voice, first.person.name)
     talk.open(asked[0])
     for number, each in enumerate(asked):
         talk.request(each, is_first=not number)
         if not number and voice.rng.random() < REFUSED_SHARE:
             talk.refuse()
-    talk.confirm(asked)
-    return tuple(talk.turns)
+    wishes = talk.confirm(asked)
+    slot = DaySlot(time=first.clock, person=first.person.name, room=room, activity=first.event.name)
+    return Conversation(slot=slot, turns=tuple(talk.turns), first_wish=wishes[0], last_wishes=wishes)
 
 
 class _Talk:
@@ -64,9 +67,11 @@ class _Talk:
         self.turns.append(DialogueTurn(speaker=self._person, act=Act.ADD, text=chore["ask"]))
         self._say(ROBOT, Act.REFUSE, "refuse", reason=chore["reason"])
 
-    def confirm(self, asked: Sequence[Asked]) -> None:
-        wanted = [each for need in asked for each in self._teller.in_short(need)]
+    def confirm(self, asked: Sequence[Asked]) -> tuple[str, ...]:
+        """Let the robot repeat all requests, and return them."""
+        wanted = tuple(each for need in asked for each in self._teller.in_short(need))
         self._say(ROBOT, Act.CONFIRM, "confirm", all=listed(wanted))
+        return wanted
 
     def _say(self, speaker: str, act: Act, kind: str, **words: str) -> None:
         text = self._voice.choose(people_table()["talk"][kind]).format(**words)
@@ -74,10 +79,9 @@ class _Talk:
 
 
 def transcript_of(
-    cast: Cast, asked: Sequence[Asked], turns: Sequence[DialogueTurn], instruction: str, goal_bddl: str
+    cast: Cast, need: NeedOfDay, conversation: Conversation, instruction: str, goal_bddl: str
 ) -> str:
     """Return people, event, conversation and goal as Markdown."""
-    first = asked[0].need
     people = "\n".join(
         f"* **{person.name}**, {person.age}, {person.job}, likes {person.hobby}"
         + "".join(f"; {tie} of {other}" for other, tie in person.ties.items())
@@ -85,9 +89,9 @@ def transcript_of(
     )
     talk = "\n\n".join(
         f"**{'Robot' if turn.speaker == ROBOT else turn.speaker}** ({turn.act.value}): {turn.text}"
-        for turn in turns
+        for turn in conversation.turns
     )
     return (
         f"# {instruction}\n\n## The people\n\n{capitalised(cast.setting)}.\n\n{people}\n\n"
-        f"## {capitalised(first.time)}: {first.event.name}\n\n{talk}\n\n## What is to be true\n\n`{goal_bddl}`\n"
+        f"## {capitalised(need.time)}: {need.event.name}\n\n{talk}\n\n## What is to be true\n\n`{goal_bddl}`\n"
     )

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
+from embomatrix.factory.language.nouns import everyday_noun
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.social.phrases import spoken_category
 from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.bddl import is_room_instance
 
@@ -78,7 +78,7 @@ class SceneKinds:
 
     def told(self) -> str:
         """Return one line for each room in everyday words, for people's dialogues."""
-        return self._lines(spoken_category)
+        return self._lines(everyday_noun)
 
     def _lines(self, name_of: Callable[[str], str]) -> str:
         lines = []

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from embomatrix.factory.social.phrases import spoken_category
+from embomatrix.factory.language.nouns import everyday_noun
 from embomatrix.factory.social.rules.faults import Fault, FaultKind
 from embomatrix.factory.social.rules.nouns import Mention, fits, is_object_of_request
 from embomatrix.factory.social.rules.reading import INDEFINITE, NUMBERS, UNIVERSAL, Reading
@@ -66,7 +66,7 @@ class InstructionRules:
         for label in self._wish.wanted:
             group = self._groups[label]
             if not self._mentions_of(group) and not self._is_pronoun_enough(group):
-                name = spoken_category(group.kind)
+                name = everyday_noun(group.kind)
                 yield Fault(
                     FaultKind.UNMENTIONED,
                     f"a condition is about {label}, and the instruction names no {name}",
@@ -143,7 +143,7 @@ class InstructionRules:
             if is_negative(part):
                 said |= set(self._reading.departures_from(mentions))
             if mentions and part.predicate not in said:
-                name = spoken_category(place.kind)
+                name = everyday_noun(place.kind)
                 found = ", ".join(sorted(said)) or "no relation"
                 yield Fault(
                     FaultKind.WRONG_RELATION,
@@ -205,7 +205,7 @@ class InstructionRules:
                 if same and not self._is_told_apart(group, other):
                     yield Fault(
                         FaultKind.AMBIGUOUS,
-                        f"the words for {label} also fit a {spoken_category(other.kind)} in {other.room}: name its room, "
+                        f"the words for {label} also fit a {everyday_noun(other.kind)} in {other.room}: name its room, "
                         "its place or its state, or declare and accept all alike ones",
                     )
                     break

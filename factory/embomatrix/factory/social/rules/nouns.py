@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from embomatrix.factory.social.phrases import spoken_category
+from embomatrix.factory.language.nouns import everyday_noun
 from embomatrix.world.bddl import ROOM_TYPES
 from embomatrix.world.catalog import Catalog
 
@@ -193,7 +193,7 @@ def is_object_of_request(mention: Mention, tokens: tuple[str, ...]) -> bool:
 
 def _full_names(kind: str) -> tuple[str, str, str]:
     synset = Catalog.load().synset_of(kind) if kind in _kinds() else kind
-    return kind.replace("_", " "), spoken_category(kind).lower(), synset.partition(".")[0].replace("_", " ")
+    return kind.replace("_", " "), everyday_noun(kind).lower(), synset.partition(".")[0].replace("_", " ")
 
 
 @functools.cache

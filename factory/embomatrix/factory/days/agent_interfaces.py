@@ -3,35 +3,29 @@
 The answer of one agent is the brief of the next: scene, people, conversation, instruction.
 """
 
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from enum import StrEnum
 from typing import Any, Final
 
-import numpy as np
-
+from embomatrix.factory.admission import TaskRefusal
+from embomatrix.factory.days.drafts import PlannedTask
+from embomatrix.factory.days.planning import people_of, plan_day
 from embomatrix.factory.layout.agent_interfaces import AgentInterface, BriefError
 from embomatrix.factory.pictures.sights import sights_of
+from embomatrix.factory.pipeline.variants import VariantOrder
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
-from embomatrix.factory.social.fitting import reasons_for
 from embomatrix.factory.social.model.agents import SocialModelAgents
 from embomatrix.factory.social.model.answers import Household
 from embomatrix.factory.social.model.dialogue import conversation_of, converse
 from embomatrix.factory.social.scene_kinds import SceneKinds, kinds_of
-from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
-from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.variant import Variant, build_variant
-from embomatrix.factory.writer.words import Voice
 from embomatrix.world.scene import Scene
+from embomatrix.world.task import TaskCategory
 
-ROOMS: Final = 3
-"""Number of a scene's rooms that a conversation is about."""
-MAX_CONVERSATIONS: Final = 40
-"""Maximum number of conversations tried. Not every goal of a scene suits one of its people."""
-NO_REASON: Final = "there is much to do today"
+MAX_DAYS: Final = 8
+"""Number of days in which a request of the category is looked for."""
 
 
 class SocialAgent(StrEnum):
@@ -50,35 +44,49 @@ def extract(brief: SceneBrief) -> SceneFacts:
 
 def play(brief: SceneBrief) -> TalkBrief:
     """Role-Playing Agent. Raise CatalogError."""
-    cast = SocialWriter(brief.seed).cast_of(build_base_scene(brief.scene, seed=brief.seed))
-    return TalkBrief(scene=brief.scene, cast=cast, seed=brief.seed)
+    scene = build_base_scene(brief.scene, seed=brief.seed)
+    return TalkBrief(scene=brief.scene, cast=people_of(_order(scene), brief.seed), seed=brief.seed)
 
 
 def simulate(brief: TalkBrief) -> SummaryBrief:
-    """Social Simulation Agent. Raise CatalogError, or BriefError if no conversation leads to a request of the category."""
-    rng = _rng(brief.scene, brief.seed)
-    variant = _variant(brief.scene, brief.seed, rng)
-    writer, view = SocialWriter(brief.seed, brief.cast), SceneView(variant.scene)
-    for _ in range(MAX_CONVERSATIONS):
-        talked = writer.talk(variant, view, brief.category, rng)
-        if talked is not None:
-            return SummaryBrief(
-                scene=brief.scene, cast=brief.cast, conversation=talked.conversation, seed=brief.seed
-            )
-    raise BriefError(
-        f"no conversation in {brief.scene} leads to a request of the category {brief.category.value!r} in "
-        f"{MAX_CONVERSATIONS} tries: try another seed, which selects other rooms"
+    """Social Simulation Agent. Raise CatalogError, or BriefError if no day leads to a request of the category."""
+    planned = next((task for task in _tasks(brief) if task.draft.task.category is brief.category), None)
+    if planned is None:
+        raise BriefError(
+            f"no day of {MAX_DAYS} in {brief.scene} leads to a request of the category {brief.category.value!r}: try "
+            "another seed"
+        )
+    return SummaryBrief(
+        scene=brief.scene, cast=brief.cast, conversation=planned.conversation, seed=brief.seed
     )
 
 
 def summarise(brief: SummaryBrief) -> RequestSummary:
-    """Summarization Agent. Raise CatalogError."""
-    rng = _rng(brief.scene, brief.seed)
-    view = SceneView(build_base_scene(brief.scene, seed=brief.seed))
-    voice = Voice(rng)
-    why = voice.choose(reasons_for(brief.conversation.slot.activity) or (NO_REASON,))
-    instruction = instruction_of(brief.conversation, brief.cast, view, voice, why)
-    return RequestSummary(instruction=instruction, wishes=brief.conversation.last_wishes)
+    """Summarization Agent. Raise CatalogError, or BriefError for a conversation that the rules did not make."""
+    talk = TalkBrief(scene=brief.scene, cast=brief.cast, seed=brief.seed)
+    for task in _tasks(talk):
+        if task.conversation == brief.conversation:
+            return RequestSummary(
+                instruction=task.draft.task.instruction, wishes=brief.conversation.last_wishes
+            )
+    raise BriefError(
+        "the rules summarise only conversations that `social-simulator` made with the same scene and seed: give --llm for "
+        "others"
+    )
+
+
+def _tasks(brief: TalkBrief) -> Iterator[PlannedTask]:
+    """Yield the tasks of the first days of a cast."""
+    scene = build_base_scene(brief.scene, seed=brief.seed)
+    for number in range(MAX_DAYS):
+        planned = plan_day(_order(scene, number), scene, brief.seed, cast=brief.cast)
+        if not isinstance(planned, TaskRefusal):
+            yield from planned.tasks
+
+
+def _order(scene: Scene, number: int = 0) -> VariantOrder:
+    rooms = tuple(room.name for room in scene.rooms)
+    return VariantOrder("train", number, scene.base, rooms, dict.fromkeys(TaskCategory, 1), frozenset())
 
 
 async def answer_with_model(agents: SocialModelAgents, name: SocialAgent, brief: Any) -> Any:
@@ -111,17 +119,6 @@ async def _talk(agents: SocialModelAgents, kinds: SceneKinds, brief: TalkBrief) 
 
 def _facts(scene: Scene) -> SceneFacts:
     return facts_of(SceneView(scene), [room.name for room in scene.rooms])
-
-
-def _rng(scene: str, seed: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(scene.encode()))))
-
-
-def _variant(name: str, seed: int, rng: np.random.Generator) -> Variant:
-    """Return a variant of random rooms of a base scene, with small objects."""
-    base = build_base_scene(name, seed=seed)
-    rooms = [str(room) for room in rng.permutation([room.name for room in base.rooms])[:ROOMS]]
-    return build_variant(base, rooms, f"{base.base}-alone", rng)
 
 
 SOCIAL_AGENTS: Final[Mapping[SocialAgent, AgentInterface]] = {

@@ -1,0 +1,112 @@
+"""Days whose people, dialogues and wishes a language model writes. The scene is laid out for the wishes."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
+from embomatrix.factory.days.drafts import Members, PlannedTask, task_of
+from embomatrix.factory.days.laying import lay_out
+from embomatrix.factory.days.planning import PlannedDay, day_name
+from embomatrix.factory.faithfulness.clauses import goal_clauses
+from embomatrix.factory.language.nouns import noun_of
+from embomatrix.factory.layout.request import LayoutAgents
+from embomatrix.factory.pipeline.variants import VariantOrder
+from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.model.writer import ModelWriter
+from embomatrix.factory.social.scene_kinds import kinds_of
+from embomatrix.factory.social.written import WrittenRequest
+from embomatrix.factory.task_import.task_fields import signature_of
+from embomatrix.factory.writer.tasks import Draft
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
+
+REQUESTS_OF_DAY: Final = 6
+"""Number of requests that a day asks the model for."""
+SEEDS: Final = 2**31
+
+
+class ModelDays:
+    """Planner of days on a language model. Earlier instructions of a build are in the model's view."""
+
+    def __init__(self, writer: ModelWriter, agents: LayoutAgents | None = None) -> None:
+        self._writer = writer
+        self._agents = agents
+
+    def plan(self, order: VariantOrder, base: Scene, seed: int) -> PlannedDay | TaskRefusal:
+        """Return a day of requests with the refusals on the way. Raise LlmError after several answers without use."""
+        key = (seed, zlib.crc32(order.split.encode()), zlib.crc32(order.base.encode()), order.number)
+        rng = np.random.default_rng(np.random.SeedSequence(key))
+        earlier = sorted(text.partition("|")[2] for text in order.known)
+        written = self._writer.write(
+            kinds_of(SceneView(base)), REQUESTS_OF_DAY, int(rng.integers(SEEDS)), earlier
+        )
+        refusals = [each for each in written if isinstance(each, TaskRefusal)]
+        requests = [each for each in written if isinstance(each, WrittenRequest)]
+        if not requests:
+            reason = TaskRefusal(
+                RefusalReason.UNUSABLE_ANSWER, "the model wrote no request that could be used"
+            )
+            return refusals[-1] if refusals else reason
+        laid = lay_out(day_name(order), [each.wish for each in requests], base, rng, self._agents)
+        if isinstance(laid, TaskRefusal):
+            return laid
+        view = SceneView(laid.scene)
+        tasks: list[PlannedTask] = []
+        for number, (at, members) in enumerate(zip(laid.kept, laid.members, strict=True)):
+            found = planned_task(f"{day_name(order)}-{number:02d}", view, requests[at], members)
+            if isinstance(found, TaskRefusal):
+                refusals.append(found)
+            else:
+                tasks.append(found)
+        return PlannedDay(laid.scene, tuple(tasks), tuple(refusals))
+
+
+def planned_task(
+    task_id: str, view: SceneView, request: WrittenRequest, members: Members
+) -> PlannedTask | TaskRefusal:
+    """Return the task of a request in the scene that is laid out; a refusal if its words also fit other objects."""
+    conditions = request.wish.conditions
+    about = tuple(dict.fromkeys(name for names in members.values() for name in names))
+    wanted = {label: members[label] for label in request.wish.wanted}
+    task = replace(task_of(task_id, view, conditions, wanted, about), instruction=request.instruction)
+    for names in wanted.values():
+        other = _also_meant(view, task, names)
+        if other:
+            return TaskRefusal(
+                RefusalReason.UNFAITHFUL,
+                f"the words for {'/'.join(names)} also fit {other}: say which one is meant",
+            )
+    draft = Draft(
+        task=task,
+        about=task.table,
+        rooms=tuple(sorted({view.room(name) for names in wanted.values() for name in names})),
+        signature=signature_of(task.goal, view),
+        intent=goal_clauses(task.goal, task.types),
+        transcript=request.transcript(),
+    )
+    return PlannedTask(draft, request.conversation)
+
+
+def _also_meant(view: SceneView, task: Task, names: Sequence[str]) -> str:
+    """Return a row of the same category whose place the instruction does not exclude; "" if there is none."""
+    said = task.instruction.lower()
+    for other in task.table:
+        if other in names or view.category(other) != view.category(names[0]):
+            continue
+        told = {*_place_words(view, names[0])} - {*_place_words(view, other)}
+        if not any(re.search(rf"\b{re.escape(word)}\b", said) for word in told):
+            return other
+    return ""
+
+
+def _place_words(view: SceneView, name: str) -> tuple[str, ...]:
+    """Return the noun of the support and of the room of an object."""
+    host, room = view.item(name).host, view.room(name).rpartition("_")[0].replace("_", " ")
+    return (room, *((noun_of(view.category(host)).one,) if host else ()))
