@@ -132,8 +132,14 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 Types whose models can't do what the tasks need are replaced as well. The catalog's only backpack is too wide for the
 gripper, its shirt is spread out, its package has no lid, and its alarm clock has no switch.
 """
-LAMPS: Final[Mapping[str, tuple[str, ...]]] = {"room_light.n.01": ("floor_lamp.n.01",)}
-"""Replacement for lights that are switched. Ceiling lights have no switch in the catalog and are out of reach."""
+LAMPS: Final[Mapping[str, tuple[str, ...]]] = {
+    "room_light.n.01": ("floor_lamp.n.01",),
+    "ceiling_fan.n.01": ("electric_fan.n.01",),
+}
+"""Replacements for what hangs at the ceiling and is switched.
+
+Ceiling lights have no switch in the catalog, and both are out of reach.
+"""
 _TYPE: Final = re.compile(r"(?<![\w.\-])([a-z_\-]+\.n\.\d+)(?![\d_])", re.IGNORECASE)
 _SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IGNORECASE)
 
