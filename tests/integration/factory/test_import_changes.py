@@ -35,7 +35,7 @@ def test_lack_counts_missing_furniture_of_the_best_rooms() -> None:
 
 
 def test_right_scene_is_one_that_the_author_names() -> None:
-    text = PROBLEM.replace(" kitchen)", " kitchen_0)")
+    text = PROBLEM.replace(" kitchen)", " kitchen_0)").replace("breakfast_table", "countertop")
     problem = parse_problem(text)
     named = SourceText("apple", text, "embomatrix", scenes=("Wainscott_0_int",))
     found = find_right_scene(source(text), problem, ["office_bike", "Wainscott_0_int"])
@@ -100,10 +100,8 @@ def test_goal_that_repeats_the_start_is_read_without_it() -> None:
 
 
 def test_fridge_is_added_to_a_scene_without_cold_for_a_goal_that_needs_it(home) -> None:
-    text = PROBLEM.replace("electric_refrigerator", "breakfast_table").replace(
-        PROBLEM[PROBLEM.index("(:goal") :], "(:goal (frozen apple.n.01_1)))"
-    )
-    problem = parse_problem(text)
+    start = PROBLEM[: PROBLEM.index("(:goal")].replace("electric_refrigerator", "breakfast_table")
+    problem = parse_problem(start + "(:goal (frozen apple.n.01_1)))")
     assert with_missing_sources(problem, home) == problem
     added = with_missing_sources(problem, dataclasses.replace(home, objects=()))
     assert set(added.objects.items()) - set(problem.objects.items()) == {
