@@ -28,6 +28,11 @@ from embomatrix.world.bddl import parse_problem
 
 SAMPLE = Path(__file__).parents[4] / "shared" / "data" / "embomatrix_tasks_sample.jsonl"
 
+SMALL = """(define (problem Take_the_apple) (:domain omnigibson)
+    (:objects apple.n.01_1 - apple.n.01 countertop.n.01_1 - countertop.n.01)
+    (:init (ontop apple.n.01_1 countertop.n.01_1) (inroom countertop.n.01_1 kitchen))
+    (:goal (not (ontop apple.n.01_1 countertop.n.01_1))))"""
+
 
 def test_number_of_expressible_goals_matches_the_documentation() -> None:
     pytest.importorskip("bddl", reason="the bddl package is not installed")
@@ -67,6 +72,30 @@ def test_unreadable_source_is_rejected_in_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "bad.jsonl").write_text(json.dumps({"name": "a", "bddl": PROBLEM}) + "\n{}\n")
     with pytest.raises(ProblemSourceError, match=r"bad.jsonl:2: expected an object"):
         list(read_jsonl(tmp_path / "bad.jsonl"))
+
+
+def test_unparsable_problem_is_refused_and_the_batch_goes_on(tmp_path: Path) -> None:
+    rows = [("good", SMALL), ("bad", SMALL[:-20]), ("empty", ""), ("again", SMALL)]
+    lines = [json.dumps({"name": name, "bddl": text, "scenes": ["Rs_int"]}) for name, text in rows]
+    (tmp_path / "problems.jsonl").write_text("\n".join(lines))
+    command = ["import", "--jsonl", str(tmp_path / "problems.jsonl"), "--scene", "Rs_int", "--bind-only"]
+    command += ["--reached-by", "household", "--solids", "--jobs", "1"]
+    done = CliRunner().invoke(
+        app, [*command, "--report", str(tmp_path / "r.json"), "--json", str(tmp_path / "rates.json")]
+    )
+    assert done.exit_code == 0, done.output
+    report = json.loads((tmp_path / "r.json").read_text())
+    found = {each["name"]: each["reason"] for each in report["outcomes"]}
+    assert found == {"good": "", "bad": "unparsable", "empty": "unparsable", "again": ""}
+    sentence = next(each["sentence"] for each in report["outcomes"] if each["name"] == "empty")
+    assert "line 1, column 1" in sentence
+    assert report["refused"] == {"unparsable": 2}
+    assert "* `empty` (unparsable): line 1" in (tmp_path / "r.md").read_text()
+    rates = {
+        each["name"]: each["value"] for each in json.loads((tmp_path / "rates.json").read_text())["figures"]
+    }
+    assert rates["import_rate_sample"] == 0.5
+    assert rates["import_rate_sample reached by household"] == 0.5
 
 
 @pytest.mark.parametrize("option", ["--report", "--json"])

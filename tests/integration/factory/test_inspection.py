@@ -150,6 +150,20 @@ def test_parquet_holds_the_same_rows(dataset, tmp_path):
     assert parquet.read_table(path).to_pylist() == rows
 
 
+def test_hub_library_reads_file_and_card(dataset, tmp_path):
+    library = pytest.importorskip("datasets", reason="datasets is not installed: pip install datasets")
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'embomatrix[export]'")
+    folder, cache = tmp_path / "export", str(tmp_path / "cache")
+    folder.mkdir()
+    done = CliRunner().invoke(app, ["export", str(dataset.folder), "--out", str(folder / "tasks.parquet")])
+    assert done.exit_code == 0, done.output
+    (read,) = library.load_dataset(str(folder), cache_dir=cache).values()
+    assert list(read.features) == list(FIELDS)
+    assert read.to_list() == export_rows(dataset)
+    alone = library.load_dataset("parquet", data_files=str(folder / "tasks.parquet"), cache_dir=cache)
+    assert alone["train"].to_list() == export_rows(dataset)
+
+
 def test_unknown_export_suffix_is_refused(dataset):
     with pytest.raises(DatasetError, match=r"expected \.jsonl or \.parquet"):
         encode_rows(export_rows(dataset), ".csv")
@@ -161,6 +175,8 @@ def test_card_counts_tasks_and_explains_every_field(dataset):
     assert f"| all | {len(dataset.train)} | {len(dataset.heldout)} |" in text
     assert all(f"| `{name}` |" in text for name in FIELDS)
     assert "imported" in text
+    assert "## Licences" in text
+    assert "`bddl` 3.6.0: MIT licence" in text
 
 
 def test_export_writes_the_card_beside_the_file(dataset, tmp_path):

@@ -28,6 +28,7 @@ from embomatrix.factory.commands.language_model import (
     model_request_writer,
 )
 from embomatrix.factory.commands.layout import lay
+from embomatrix.factory.commands.merge import merge
 from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics
 from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
@@ -49,7 +50,7 @@ from embomatrix.world.whole_file import write_whole
 app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
-for command in (agent, lay, inspect, pictures, corpus, verify, audit, evaluate):
+for command in (agent, lay, inspect, pictures, corpus, merge, verify, audit, evaluate):
     app.command()(command)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]

@@ -19,7 +19,7 @@ from embomatrix.world.asset import Asset
 from embomatrix.world.bddl import BddlProblem, InitLiteral, is_room_instance, parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import map_atoms, subformulas
-from embomatrix.world.goal import Atom, Quantified
+from embomatrix.world.goal import And, Atom, Formula, Quantified
 from embomatrix.world.state import Relation
 
 RENAMED: Final[Mapping[str, tuple[str, ...]]] = {
@@ -132,8 +132,14 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 Types whose models can't do what the tasks need are replaced as well. The catalog's only backpack is too wide for the
 gripper, its shirt is spread out, its package has no lid, and its alarm clock has no switch.
 """
-LAMPS: Final[Mapping[str, tuple[str, ...]]] = {"room_light.n.01": ("floor_lamp.n.01",)}
-"""Replacement for lights that are switched. Ceiling lights have no switch in the catalog and are out of reach."""
+LAMPS: Final[Mapping[str, tuple[str, ...]]] = {
+    "room_light.n.01": ("floor_lamp.n.01",),
+    "ceiling_fan.n.01": ("electric_fan.n.01",),
+}
+"""Replacements for what hangs at the ceiling and is switched.
+
+Ceiling lights have no switch in the catalog, and both are out of reach.
+"""
 _TYPE: Final = re.compile(r"(?<![\w.\-])([a-z_\-]+\.n\.\d+)(?![\d_])", re.IGNORECASE)
 _SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IGNORECASE)
 
@@ -147,8 +153,9 @@ def read_problem(source: SourceText) -> tuple[BddlProblem, tuple[str, ...]]:
     words = GROUPS if source.source == EAI else RENAMED
     text, replaced = translate_types(source.text, {**words, **_lamps_for(source.text)})
     problem, read = with_possible_relations(parse_problem(text))
+    problem, left = without_places_left(problem)
     problem, added = with_implied_rooms(problem)
-    return problem, (*replaced, *read, *added)
+    return problem, (*replaced, *read, *left, *added)
 
 
 def _lamps_for(text: str) -> dict[str, tuple[str, ...]]:
@@ -220,6 +227,45 @@ def _assets_of(type_name: str) -> Iterator[Asset]:
     for category in catalog.categories_of(type_name) if catalog.has_synset(type_name) else ():
         for model in catalog.models_of(category):
             yield build_asset(catalog, model.category, model.model_id)
+
+
+def without_places_left(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:
+    """Drop the start's place of an object that the goal also wants elsewhere, and return a sentence for each.
+
+    Some of the paper's goals repeat the start: *on the floor and on the shelf*. No state meets them. A pair of hosts of
+    which one is on or in the other is no contradiction.
+    """
+    parts = _conjuncts(problem.goal)
+    wanted = [part for part in parts if isinstance(part, Atom) and part.predicate == Relation.ONTOP]
+    started = {item.atom for item in problem.init if item.positive}
+    rests = {frozenset(pair) for pair in problem.initial_pairs(Relation.ONTOP, Relation.INSIDE)}
+    rests |= {frozenset(part.args) for part in parts if isinstance(part, Atom) and len(part.args) == 2}
+    dropped = [
+        part
+        for part in wanted
+        if part in started
+        and any(
+            other.args[0] == part.args[0]
+            and other not in started
+            and frozenset((other.args[1], part.args[1])) not in rests
+            for other in wanted
+        )
+    ]
+    if not dropped:
+        return problem, ()
+    goal = And(tuple(part for part in parts if part not in dropped))
+    notes = tuple(
+        f"({' '.join((part.predicate, *part.args))}) is left out of the goal: the object is to go elsewhere"
+        for part in dropped
+    )
+    return dataclasses.replace(problem, goal=goal), notes
+
+
+def _conjuncts(goal: Formula) -> list[Formula]:
+    """Return the parts of a goal that must all hold."""
+    if not isinstance(goal, And):
+        return [goal]
+    return [part for each in goal.parts for part in _conjuncts(each)]
 
 
 def with_implied_rooms(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:

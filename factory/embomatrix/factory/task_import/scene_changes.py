@@ -3,6 +3,7 @@
 A binding without changes is *faithful*: the problem's own small objects were added, as it demands, and nothing else.
 """
 
+import functools
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,9 +11,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.task_import.binding import Binding, fixtures_of
-from embomatrix.factory.task_import.search import room_type_of, type_is_liftable
+from embomatrix.factory.task_import.search import room_type_of
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.world.bddl import BddlProblem
 from embomatrix.world.catalog import Catalog, SceneInventory, share_of
@@ -95,10 +96,22 @@ def lacking(problem: BddlProblem, stock: Sequence[RoomStock]) -> int | None:
     wanted = Counter(
         (inroom[name], problem.objects[name])
         for name in fixtures_of(problem)
-        if not type_is_liftable(problem.objects[name])
+        if _is_furniture(problem.objects[name])
     )
     choices = itertools.islice(_room_choices(sorted(set(inroom.values())), stock), MAX_ROOM_CHOICES)
     return min((_missing(wanted, rooms) for rooms in choices), default=None)
+
+
+@functools.cache
+def _is_furniture(type_name: str) -> bool:
+    """True if the robot can't carry most models of the type. A shelf is furniture though one model is small."""
+    catalog = Catalog.load()
+    carried = [
+        is_liftable(model.size_m, catalog.category(category).mass_kg)
+        for category in (catalog.categories_of(type_name) if catalog.has_synset(type_name) else ())
+        for model in catalog.models_of(category)
+    ]
+    return 2 * sum(carried) < len(carried) or not carried
 
 
 def _room_choices(words: Sequence[str], stock: Sequence[RoomStock]) -> Iterator[Mapping[str, RoomStock]]:

@@ -1,6 +1,5 @@
 """Search for a problem's furniture in a scene, by backtracking over rooms and objects."""
 
-import functools
 import itertools
 import math
 from collections import defaultdict
@@ -147,7 +146,8 @@ def _domains(
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():
-        contents = requirement_on(requirements, name, problem.objects[name]).contents
+        requirement = requirement_on(requirements, name, problem.objects[name])
+        contents = requirement.contents
         categories = set(catalog.categories_of(problem.objects[name]))
         fits = [
             other
@@ -155,6 +155,7 @@ def _domains(
             if view.category(other) in categories
             and other not in excluded
             and has_abilities(view.asset(other), needs.get(name, frozenset()))
+            and not (requirement.carried and _is_too_heavy(view, other))
         ]
         if fits:
             order = [str(other) for other in rng.permutation(fits)]
@@ -163,9 +164,15 @@ def _domains(
             if contents:
                 order.sort(key=lambda other: room_for(view.asset(other), contents))
             domains[name] = order
-        elif not type_is_liftable(problem.objects[name]):
+        elif not any(_liftable(category) for category in categories):
             missing.append(name)
     return domains, missing
+
+
+def _is_too_heavy(view: SceneView, name: str) -> bool:
+    """True if the robot can't carry the object. A scaled one is added in its place."""
+    asset = view.asset(name)
+    return not is_liftable(asset.size_m, asset.mass_kg)
 
 
 def _spare_m2(view: SceneView, name: str) -> float:
@@ -231,14 +238,6 @@ def _backtrack(
 def has_abilities(asset: Asset, needs: Iterable[str]) -> bool:
     """True if the asset has all abilities. A container has a cavity."""
     return all(bool(asset.interiors) if need == "container" else asset.can(need) for need in needs)
-
-
-@functools.cache
-def type_is_liftable(type_name: str) -> bool:
-    """True if a model of the type is small and light enough for the robot. An import adds such objects."""
-    catalog = Catalog.load()
-    categories = catalog.categories_of(type_name) if catalog.has_synset(type_name) else ()
-    return any(_liftable(category) for category in categories)
 
 
 def _liftable(category: str) -> bool:

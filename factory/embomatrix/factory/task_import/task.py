@@ -21,6 +21,7 @@ from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.task_import.binding import Addition, Binding, bind
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
+from embomatrix.factory.task_import.missing_sources import with_missing_sources
 from embomatrix.factory.task_import.models import models_for, with_sizes
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, pieces_of, profile_for
@@ -118,7 +119,7 @@ class _Binder:
         options: ImportOptions,
     ) -> None:
         self._source = source
-        self._problem = problem
+        self._problem = with_missing_sources(problem, base) if options.reachable else problem
         self._substances = {name: synset for name, synset in problem.objects.items() if is_substance(synset)}
         self._base = base
         self._rng = rng

@@ -2,7 +2,7 @@
 
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Final
 
@@ -15,6 +15,8 @@ from embomatrix.world.goal import Formula
 from embomatrix.world.state import THERMAL, State
 from embomatrix.world.substances import WATER
 
+MAX_SOURCES: Final = 2
+"""Maximum number of appliances added to the table for each object that gets hot, cooked or frozen."""
 _ROOM_OR_TEXT: Final = re.compile(
     rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
     re.IGNORECASE,
@@ -49,12 +51,15 @@ def signature_of(goal: Formula, view: SceneView) -> str:
 
 
 def sources_for(
-    view: SceneView, goal: Formula, types: Mapping[str, tuple[str, ...]], known: Iterable[str]
+    view: SceneView, goal: Formula, types: Mapping[str, tuple[str, ...]], known: Collection[str]
 ) -> Iterator[str]:
     """Yield appliances of the scene that heat, cook or freeze what the goal requires and the problem's objects can't.
 
+    There may be several for each object: the door of the nearest one may be blocked.
+
     The paper's tasks freeze food in coolers, which only keep drinks cool.
     """
+    rooms = {view.room(name) for name in known}
     for atom in atoms_of(goal):
         if atom.predicate not in THERMAL:
             continue
@@ -65,15 +70,16 @@ def sources_for(
                 continue
             if any(effect in view.thermal_effects(object_name, name) for name in known):
                 continue
-            able = (
+            able = [
                 item.name
                 for item in view.scene.objects
                 if item.fixed
                 and view.is_source(item.name)
                 and effect in view.thermal_effects(object_name, item.name)
                 and view.opens(item.name)
-            )
-            yield from itertools.islice(able, 1)
+            ]
+            able.sort(key=lambda name: view.room(name) not in rooms)
+            yield from able[:MAX_SOURCES]
 
 
 def taps_for(view: SceneView, goal: Formula, known: Iterable[str]) -> Iterator[str]:
