@@ -12,6 +12,7 @@ from embomatrix.factory.commands.agents import agent
 from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.build import make_dataset
 from embomatrix.factory.commands.corpus import corpus
+from embomatrix.factory.commands.difficulty import difficulty
 from embomatrix.factory.commands.evaluate import evaluate
 from embomatrix.factory.commands.faithfulness import audit
 from embomatrix.factory.commands.inspection import inspect, pictures
@@ -45,7 +46,7 @@ from embomatrix.world.whole_file import write_whole
 app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
-for command in (agent, lay, inspect, pictures, corpus, verify, audit, evaluate):
+for command in (agent, lay, inspect, pictures, corpus, verify, audit, evaluate, difficulty):
     app.command()(command)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
@@ -177,9 +178,25 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
     with user_errors():
         dataset = Dataset.load(folder)
     # Other commands take the task's id as an argument, so the column never truncates it.
-    columns = (Column("task", no_wrap=True), "split", "category", "rows", "steps", "instruction")
+    columns = (
+        Column("task", no_wrap=True),
+        "split",
+        "category",
+        "rows",
+        "steps",
+        "difficulty",
+        "instruction",
+    )
     rows = (
-        (task.task_id, record.split, task.category, len(task.table), len(record.oracle), task.instruction)
+        (
+            task.task_id,
+            record.split,
+            task.category,
+            len(task.table),
+            len(record.oracle),
+            "" if record.difficulty is None else record.difficulty.level,
+            task.instruction,
+        )
         for record in dataset.records
         for task in (record.task,)
     )

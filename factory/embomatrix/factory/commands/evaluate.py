@@ -20,6 +20,7 @@ from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
+from embomatrix.factory.evaluate.scripts import evaluate_scripts
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -39,14 +40,18 @@ def evaluate(
     parts: Annotated[
         list[str],
         typer.Argument(
-            help="Parts to measure: tasks, scenes, looks, admission, aesthetics. A .json file of figures is read instead."
+            help="Parts to measure: tasks, scripts, scenes, looks, admission, aesthetics. A .json file of figures is read."
         ),
     ],
     dataset: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset for the parts tasks and admission. Default for tasks: draft tasks with both writers."
+            help="Dataset for the parts tasks, scripts and admission. Default for tasks: draft tasks with both writers."
         ),
+    ] = None,
+    training: Annotated[
+        Path | None,
+        typer.Option(help="Dataset whose training tasks the scripts learn from. Default: that of --dataset."),
     ] = None,
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
     sample: Annotated[
@@ -58,7 +63,7 @@ def evaluate(
         Path | None,
         typer.Option(help="JSON lines file for the outcomes of scenes; an interrupted run resumes from it."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes and scripts.")] = 1,
     rooms: Annotated[
         Path | None, typer.Option(help="Gzipped JSON file with hand-made rooms, for aesthetics.")
     ] = None,
@@ -75,13 +80,16 @@ def evaluate(
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
     ] = None,
 ) -> None:
-    """Measure parts of the factory: diversity of tasks, layouts of fixed tasks, admission of drafts, aesthetics.
+    """Measure parts of the factory: diversity of tasks, success of scripts, layouts of fixed tasks, admission, aesthetics.
 
     A language model judges looks, and also tasks if one is given.
     """
     judge = partial(chat_model, llm, model, key, cassette)
     measures: Mapping[str, Callable[[], EvaluationFigures]] = {
         "tasks": lambda: _tasks(dataset, each, seed, judge() if llm or cassette else None),
+        "scripts": lambda: evaluate_scripts(
+            _given(dataset, "--dataset FOLDER"), training, jobs=jobs, counter=counter
+        ),
         "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes),
         "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
