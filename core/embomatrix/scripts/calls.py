@@ -23,6 +23,7 @@ _PHASES: Final[Mapping[str, int]] = {
 }
 """Order of the demands of a plan: doors and switches last, since work at a machine changes both."""
 _OTHER_PHASE: Final = 1
+_PLACEMENTS: Final = frozenset(PlaceRelation)
 WETTING: Final = frozenset({"soaked", "saturated", "filled"})
 DIRT: Final = frozenset({"dusty", "stained", "covered"})
 _TOOL_SKILLS: Final = (Skill.SLICE, Skill.CLEAN, Skill.SOAK)

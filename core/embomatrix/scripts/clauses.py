@@ -87,8 +87,8 @@ class ClauseTemplates:
                 self._using[clause.mentions, word].append(clause)
         self._sizes = {clause: self._size(clause) for clause in self._meanings}
 
-    def read(self, tokens: Words, mentions: Sequence[Mention]) -> list[ReadClause]:
-        """Split an instruction into clauses and return those that demand something, in order.
+    def read(self, tokens: Words, mentions: Sequence[Mention]) -> tuple[float, list[ReadClause]]:
+        """Split an instruction into clauses. Return the mean similarity and the clauses that demand something, in order.
 
         Of all divisions of the mentions into neighbouring groups, the one with the best matches is taken.
         """
@@ -97,12 +97,13 @@ class ClauseTemplates:
             options = [best[end - 1]]  # a mention that no template explains
             for first in range(max(0, end - MOST_MENTIONS), end):
                 score, meaning = self.match(clause_of(tokens, mentions, first, end - 1))
-                found = () if meaning is None else (ReadClause(first, meaning),)
+                found: tuple[ReadClause, ...] = () if meaning is None else (ReadClause(first, meaning),)
                 before = best[first]
                 score *= _WITHOUT_DEMAND if meaning is None else 1.0
                 options.append((before[0] + score * (end - first), (*before[1], *found)))
             best.append(max(options, key=lambda option: option[0]))
-        return list(best[-1][1])
+        total, read = best[-1]
+        return total / max(1, len(mentions)), list(read)
 
     def match(self, clause: Clause) -> tuple[float, ClauseMeaning | None]:
         """Return the similarity of the best template, from 0 to 1, and its meaning."""

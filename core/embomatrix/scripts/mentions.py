@@ -53,13 +53,19 @@ RoomSpan = tuple[int, int, tuple[str, ...]]
 class Mention:
     """Noun phrase: its tokens ``start`` to ``end``, and the rows that fit its words. Pronouns have no rows.
 
-    ``count`` is the number of objects that it denotes; 0 means all that fit.
+    ``count`` is the number of objects that it denotes; 0 means all that fit. ``parts`` are the members of a list.
     """
 
     start: int
     end: int
     rows: tuple[PromptRow, ...] = ()
     count: int = 1
+    parts: tuple[Mention, ...] = ()
+
+    @property
+    def each(self) -> tuple[Mention, ...]:
+        """The members of a list, or the mention itself."""
+        return self.parts or (self,)
 
     @property
     def is_pronoun(self) -> bool:

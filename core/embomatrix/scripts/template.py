@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from embomatrix.scripts.calls import Habits, ScriptDemand, plan_for
-from embomatrix.scripts.clauses import ClauseMeaning, ClauseTemplates, aligned
+from embomatrix.scripts.clauses import ClauseMeaning, ClauseTemplates, ReadClause, aligned
+from embomatrix.scripts.joining import readings
 from embomatrix.scripts.mentions import Lexicon, Mention, tokens_of
 from embomatrix.skills.syntax import MAX_STEPS, Plan, Skill, SkillCall
 from embomatrix.world.state import THERMAL, State
 
 if TYPE_CHECKING:
     from embomatrix.scripts.examples import ScriptExample
+    from embomatrix.scripts.similarity import Words
     from embomatrix.skills.prompt import PromptRow, Situation
 
 
@@ -47,13 +49,16 @@ class TemplateScript:
         A pronoun stands for the things of the demand before it. A place that was named before is meant again.
         """
         tokens = tokens_of(situation.instruction)
-        mentions = self._lexicon.mentions(tokens, situation)
         found: list[ScriptDemand] = []
         things: list[tuple[PromptRow, ...]] = []
-        for clause in self._templates.read(tokens, mentions):
+        mentions, clauses = self._best_reading(tokens, situation)
+        for clause in clauses:
             meaning = clause.meaning
             named = mentions[clause.first + meaning.thing]
-            things = things if named.is_pronoun and things else _chosen(named, meaning)
+            if not named.is_pronoun:
+                things = _chosen(named, meaning)
+            elif not things:
+                things = _antecedent(mentions, clause.first + meaning.thing)
             at = None if meaning.place is None else mentions[clause.first + meaning.place]
             places = () if at is None else at.rows
             if at is not None and at.is_pronoun and found:
@@ -63,13 +68,34 @@ class TemplateScript:
             found += [ScriptDemand(meaning.predicate, meaning.holds, rows, places) for rows in things]
         return found
 
+    def _best_reading(
+        self, tokens: Words, situation: Situation
+    ) -> tuple[Sequence[Mention], Sequence[ReadClause]]:
+        """Return the mentions, joined where that explains the words better, and the clauses."""
+        best: tuple[float, Sequence[Mention], Sequence[ReadClause]] = (-1.0, (), ())
+        for mentions in readings(tokens, self._lexicon.mentions(tokens, situation)):
+            score, clauses = self._templates.read(tokens, mentions)
+            if score > best[0]:
+                best = (score, mentions, clauses)
+        return best[1], best[2]
+
+
+def _antecedent(mentions: Sequence[Mention], pronoun: int) -> list[tuple[PromptRow, ...]]:
+    """Return the last object before a pronoun that can be carried; empty if there is none."""
+    loose = (tuple(row for row in mention.rows if not row.fixed) for mention in reversed(mentions[:pronoun]))
+    return [rows for rows in loose if rows][:1]
+
 
 def _chosen(mention: Mention, meaning: ClauseMeaning) -> list[tuple[PromptRow, ...]]:
     """Return the things that a mention denotes, each with its alternatives."""
-    rows = sorted(mention.rows, key=lambda row: not _is_suitable(row, meaning))
-    if mention.count == 1:
-        return [tuple(rows)] if rows else []
-    return [(row,) for row in (rows[: mention.count] if mention.count else rows)]
+    found: list[tuple[PromptRow, ...]] = []
+    for part in mention.each:
+        rows = sorted(part.rows, key=lambda row: not _is_suitable(row, meaning))
+        if part.count == 1:
+            found.append(tuple(rows))
+        else:
+            found += [(row,) for row in (rows[: part.count] if part.count else rows)]
+    return found
 
 
 def _is_suitable(row: PromptRow, meaning: ClauseMeaning) -> bool:
