@@ -38,6 +38,7 @@ _ARTICLES: Final = frozenset(
         "those",
     }
 )
+_DETERMINERS: Final = _ARTICLES - {"of", "one"} | _EVERY | _NUMBERS.keys()
 _BEFORE_ROOM: Final = frozenset({"in", "from", "of", "into", "at", "inside", "to"})
 _MOST_BETWEEN: Final = 3
 """Words between an object and the room that it is said to be in: ``over there in``."""
@@ -187,20 +188,18 @@ def _by_category(situation: Situation) -> dict[str, list[PromptRow]]:
 
 
 def _by_head(tokens: Words, situation: Situation, taken: set[int]) -> Iterator[Mention]:
-    """Yield mentions that name only the last word of a category, as ``sink`` for ``pedestal_sink``."""
+    """Yield phrases after an article that end with the last word of a category, as ``the sink`` for ``pedestal_sink``."""
     heads: dict[str, list[PromptRow]] = {}
     for row in situation.rows:
         heads.setdefault(row.category.split("_")[-1], []).append(row)
     for at, token in enumerate(tokens):
         rows = [row for head, alike in heads.items() if is_form_of((token,), (head,)) for row in alike]
-        if rows and at not in taken and at - 1 not in taken:
-            start = at
-            while start - 1 not in taken and start > 0 and at - start < _LONGEST_NAME - 1:
-                if tokens[start - 1] in _ARTICLES:
-                    break
-                start -= 1
-            is_phrase = start > 0 and tokens[start - 1] in _ARTICLES
-            yield Mention(start if is_phrase else at, at + 1, tuple(rows), 1 if token in heads else 0)
+        start = at
+        while 0 < start and at - start < _LONGEST_NAME and tokens[start - 1] not in _DETERMINERS:
+            start -= 1
+        whole = not any(place in taken for place in range(start - 1, at + 1))
+        if rows and whole and start > 0 and tokens[start - 1] in _DETERMINERS:
+            yield Mention(start, at + 1, tuple(rows), 1 if token in heads else 0)
 
 
 def _pronouns(tokens: Words, first: int) -> Iterator[Mention]:
