@@ -144,8 +144,8 @@ class _CallWriter:
     def achieve(self, demand: ScriptDemand) -> Iterator[SkillCall]:
         thing, place = demand.things[0], next(iter(demand.places), None)
         match demand.predicate, demand.holds:
-            case ((Relation.INSIDE | Relation.ONTOP | Relation.UNDER), True) if place is not None:
-                yield from self._carry(thing, place, PlaceRelation(demand.predicate))
+            case predicate, True if predicate in _PLACEMENTS and place is not None:
+                yield from self._carry(thing, place, PlaceRelation(predicate))
             case Relation.TOUCHING, True if place is not None:
                 yield from self._carry(thing, place, PlaceRelation.ONTOP)
             case Relation.NEXTTO, True if place is not None and place.host in self._rows:
@@ -161,7 +161,7 @@ class _CallWriter:
             case State.SLICED, True:
                 yield from self._work(Skill.SLICE, thing, demand.places)
             case predicate, False if predicate in DIRT:
-                yield from self._clean(thing, demand.places)
+                yield from self._work(Skill.CLEAN, thing, demand.places)
             case predicate, True if predicate in WETTING:
                 yield from self._soak(thing, demand.places)
 
@@ -240,38 +240,48 @@ class _CallWriter:
         return [*named, *(row for kind in usual for row in self._rows.values() if row.category == kind)]
 
     def _work(self, skill: Skill, item: PromptRow, named: Sequence[PromptRow]) -> Iterator[SkillCall]:
-        """Use the first tool on an object and put the tool back."""
+        """Use the first tool on an object and put it back. A tool that should take off more than dust is soaked first."""
         for tool in self._tools(skill, named)[:1]:
-            host, relation = self._places[tool.name]
+            back = self._places[tool.name]
             yield from self._uncover(item)
-            yield from self._fetch(tool)
+            if skill is Skill.CLEAN and _is_stained(item) and tool.name not in self._wet:
+                yield from self._soaked(tool, ())
+            else:
+                yield from self._fetch(tool)
             yield from self._move(item)
             yield SkillCall(skill, item.index, tool.index)
-            back = self._rows.get(host, item)
-            yield from self._move(back)
-            put = (
-                PlaceRelation(relation.value)
-                if host in self._rows and relation is not None
-                else PlaceRelation.ONTOP
-            )
-            yield SkillCall(Skill.PLACE, back.index, relation=put)
-
-    def _clean(self, item: PromptRow, named: Sequence[PromptRow]) -> Iterator[SkillCall]:
-        """Wipe an object with a tool; one that takes stains off is soaked first."""
-        stained = any(word in state for state in item.states for word in ("stain", "grease", "mud", "ink"))
-        for tool in self._tools(Skill.CLEAN, named)[:1]:
-            if stained and tool.name not in self._wet:
-                yield from self._soak(tool, ())
-            yield from self._work(Skill.CLEAN, item, (tool,))
+            yield from self._put_back(tool, back)
 
     def _soak(self, item: PromptRow, named: Sequence[PromptRow]) -> Iterator[SkillCall]:
-        """Let a running source wet an object that lies in it."""
-        for source in self._tools(Skill.SOAK, named)[:1]:
-            yield from self._carry(item, source, PlaceRelation.INSIDE)
+        back = self._places[item.name]
+        yield from self._soaked(item, named)
+        yield from self._put_back(item, back)
+
+    def _soaked(self, item: PromptRow, named: Sequence[PromptRow]) -> Iterator[SkillCall]:
+        """Fetch an object and hold it under a running source."""
+        sources = self._tools(Skill.SOAK, named)[:1]
+        for source in sources:
             yield from self._switch(source, on=True)
+        yield from self._fetch(item)
+        for source in sources:
             yield from self._move(source)
             yield SkillCall(Skill.SOAK, item.index, source.index)
             self._wet.add(item.name)
+
+    def _put_back(self, item: PromptRow, place: tuple[str, Relation | None]) -> Iterator[SkillCall]:
+        """Put the held object where it was; on the first fixed row if the prompt doesn't tell."""
+        host, relation = place
+        known = host in self._rows and relation is not None
+        back = self._rows[host] if known else next(row for row in self._rows.values() if row.fixed)
+        yield from self._move(back)
+        put = PlaceRelation(relation.value) if known and relation is not None else PlaceRelation.ONTOP
+        yield SkillCall(Skill.PLACE, back.index, relation=put)
+        self._places[item.name] = (back.name, Relation(put.value))
+
+
+def _is_stained(row: PromptRow) -> bool:
+    """Return True if something other than dust covers an object."""
+    return any(state == "stained" or state.startswith("covered_with") for state in row.states)
 
 
 def _has_door(row: PromptRow) -> bool:

@@ -195,7 +195,7 @@ def _by_head(tokens: Words, situation: Situation, taken: set[int]) -> Iterator[M
     for at, token in enumerate(tokens):
         rows = [row for head, alike in heads.items() if is_form_of((token,), (head,)) for row in alike]
         start = at
-        while 0 < start and at - start < _LONGEST_NAME and tokens[start - 1] not in _DETERMINERS:
+        while start > 0 and at - start < _LONGEST_NAME and tokens[start - 1] not in _DETERMINERS:
             start -= 1
         whole = not any(place in taken for place in range(start - 1, at + 1))
         if rows and whole and start > 0 and tokens[start - 1] in _DETERMINERS:
