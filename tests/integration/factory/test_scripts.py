@@ -86,6 +86,7 @@ def test_template_script_reads_at_least_nine_in_ten_held_out_instructions_of_the
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_template_script_solves_at_least_nine_in_ten_held_out_tasks_of_the_old_corpus(tmp_path) -> None:
     built = (
         "build",
