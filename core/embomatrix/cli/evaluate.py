@@ -50,11 +50,12 @@ from embomatrix.trainer.evaluation.answers import (
     ordered,
     read_answers,
 )
-from embomatrix.trainer.evaluation.baselines import PLANNERS, BaselineName
+from embomatrix.trainer.evaluation.baselines import PLANNERS, SCRIPTS, BaselineName, fitted_scripts
 from embomatrix.trainer.evaluation.benchmark import Benchmark, find_benchmark
 from embomatrix.trainer.evaluation.exam import Question, WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import ScoreRow, read_row, report_of, text_report
+from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.task import MAX_TABLE, Profile
 from embomatrix.world.whole_file import write_whole
 
@@ -129,6 +130,13 @@ def evaluate(
         str, _option(_SUBJECT, "--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="API key of the endpoint.")
     ] = "",
     baseline: Annotated[BaselineName | None, _option(_SUBJECT, help="Baseline without a model.")] = None,
+    training: Annotated[
+        Path | None,
+        _option(
+            _SUBJECT,
+            help="Dataset whose training tasks the baselines template and nearest learn from. Default: that of --bench.",
+        ),
+    ] = None,
     answers: Annotated[Path | None, _option(_SUBJECT, help="Stored answers to judge again.")] = None,
     bench: Annotated[
         str,
@@ -177,12 +185,14 @@ def evaluate(
             return
         if bench == NATIVE and (split or settings.tasks):
             raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
+        if training is not None and baseline not in SCRIPTS:
+            raise TrainerError(f"--training is for the baselines {' and '.join(SCRIPTS)}: leave it out")
         label = model or model_name or str(baseline)
         with _exam(open_executor, bench or DEFAULT_BENCH, split, settings.tasks, settings.profile) as exam:
             folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
             rows = [read_row(path, exam.digest) for path in beside or []]
             if baseline is not None:
-                subject = Subject(functools.partial(ask_script, _baseline(exam, baseline)))
+                subject = Subject(functools.partial(ask_script, _baseline(exam, baseline, training)))
             elif model:
                 subject = _policy(exam, model, settings)
             else:
@@ -282,7 +292,9 @@ def _endpoint(url: str, model_name: str, key: str, settings: EvalSettings, folde
     return Subject(ask, settings.codec or Codec.JSON, max_tokens=settings.max_tokens or ENDPOINT_TOKENS)
 
 
-def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
+def _baseline(
+    exam: Exam, name: BaselineName, training: Path | None
+) -> Callable[[str, np.random.Generator], str]:
     """Function that writes a baseline's answer: its plan in our world, the published human plan in EAI's."""
     if isinstance(exam, NativeExam):
         if name is not BaselineName.HUMAN:
@@ -292,8 +304,19 @@ def _baseline(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Genera
         return lambda task_id, rng: exam.human(task_id)
     if name is BaselineName.HUMAN:
         raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
-    plan, tasks = PLANNERS[name], exam.bench.tasks
+    bench, tasks = exam.bench, exam.bench.tasks
+    if name in SCRIPTS:
+        scripts = fitted_scripts(name, bench.training if training is None else _training_tasks(training))
+        return lambda task_id, rng: json.dumps(plan_to_json(scripts.plan(task_id, tasks[task_id].situation)))
+    plan = PLANNERS[name]
     return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
+
+
+def _training_tasks(folder: Path) -> Dataset:
+    try:
+        return Dataset.load(folder)
+    except DatasetError as error:
+        raise TrainerError(str(error)) from error
 
 
 def _ask(

@@ -1,5 +1,6 @@
 """Figures of benchmarks and evaluations: a value, its number of measurements, and its goal."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -7,6 +8,8 @@ from typing import Any, Final
 
 _DIGITS: Final = 3
 _MOST_DIGITS: Final = 6
+_Z: Final = 1.959963984540054
+"""Quantile of the standard normal distribution at 0.975: intervals are of 95 %."""
 
 
 class Better(StrEnum):
@@ -94,3 +97,23 @@ def figure_from_json(item: Mapping[str, Any]) -> Figure:
         int(item["n"]),
         goal,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def as_percent(self) -> str:
+        return f"{self.value:.1%} [{self.low:.1%}, {self.high:.1%}]"
+
+
+def wilson(share: float, count: int) -> Interval:
+    """Wilson score interval (1927) of a share of ``count`` >= 1 independent trials."""
+    middle = share + _Z**2 / (2 * count)
+    spread = _Z * math.sqrt(share * (1 - share) / count + _Z**2 / (4 * count**2))
+    scale = 1 + _Z**2 / count
+    return Interval(share, max(0.0, (middle - spread) / scale), min(1.0, (middle + spread) / scale))

@@ -8,25 +8,29 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+import msgspec
 from msgspec import Meta
 
 from embomatrix.world.bundle import Bundle, decode_bundle
 from embomatrix.world.codec_task import task_of, task_to_json
+from embomatrix.world.difficulty import Difficulty
 from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError
 from embomatrix.world.intent import IntentClause
 from embomatrix.world.json_text import parse_json
-from embomatrix.world.records import Record, SceneInvalidError, TaskJson, Text, convert
+from embomatrix.world.records import Record, SceneInvalidError, Share, TaskJson, Text, convert
 from embomatrix.world.task import Task
 from embomatrix.world.whole_file import read_whole, write_whole
 
 TASKS_FILE: Final = "tasks.jsonl"
 BUNDLES_FOLDER: Final = "bundles"
 SPLITS: Final = ("train", "heldout")
+MAX_PLAN_STEPS: Final = 1_000
+"""Steps of an oracle's plan in a measured difficulty."""
 _REMEDY: Final = "copy the dataset again, or build one with `embomatrix factory build`"
 
 
@@ -38,7 +42,7 @@ class DatasetError(ValueError):
 class TaskRecord:
     """Admitted task. ``oracle`` is a plan that reaches the goal, as JSON; ``signature`` names the kind of goal.
 
-    ``intent`` is what the instruction demands; empty if its writer did not say.
+    ``intent`` is what the instruction demands; empty if its writer did not say. ``difficulty`` is None until it is measured.
     """
 
     task: Task
@@ -48,6 +52,7 @@ class TaskRecord:
     rooms: tuple[str, ...]
     signature: str
     intent: tuple[IntentClause, ...] = ()
+    difficulty: Difficulty | None = None
 
 
 @dataclass(frozen=True)
@@ -151,12 +156,17 @@ def write_dataset(folder: Path | str, records: Sequence[TaskRecord], bundles: Ma
     (root / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
     for digest, data in bundles.items():
         write_whole(root / BUNDLES_FOLDER / bundle_file(digest), data)
+    write_whole(root / TASKS_FILE, encode_records(records))
+
+
+def encode_records(records: Iterable[TaskRecord]) -> bytes:
+    """Content of a file of task records, one a line."""
     lines = [json.dumps(record_to_json(record), separators=(",", ":")) for record in records]
-    write_whole(root / TASKS_FILE, "".join(f"{line}\n" for line in lines).encode("ascii"))
+    return "".join(f"{line}\n" for line in lines).encode("ascii")
 
 
 def record_to_json(record: TaskRecord) -> dict[str, Any]:
-    """Record as JSON values. An empty intent is left out."""
+    """Record as JSON values. An empty intent and an unknown difficulty are left out."""
     value: dict[str, Any] = {
         "task": task_to_json(record.task),
         "bundle": record.bundle_digest,
@@ -172,6 +182,8 @@ def record_to_json(record: TaskRecord) -> dict[str, Any]:
             | ({} if clause.holds else {"holds": False})
             for clause in record.intent
         ]
+    if record.difficulty is not None:
+        value["difficulty"] = asdict(record.difficulty)
     return value
 
 
@@ -182,6 +194,14 @@ class IntentJson(Record):
     holds: bool = True
 
 
+class DifficultyJson(Record):
+    template: bool
+    nearest: bool
+    greedy: bool
+    steps: Annotated[int, Meta(ge=0, le=MAX_PLAN_STEPS)]
+    small_policy: Share | None = None
+
+
 class TaskRecordJson(Record):
     task: TaskJson
     bundle: str
@@ -190,6 +210,7 @@ class TaskRecordJson(Record):
     rooms: tuple[str, ...]
     signature: Text
     intent: tuple[IntentJson, ...] = ()
+    difficulty: DifficultyJson | None = None
 
 
 def record_from_json(value: object) -> TaskRecord:
@@ -210,6 +231,9 @@ def record_from_json(value: object) -> TaskRecord:
             IntentClause(clause.predicate, clause.things, clause.places, clause.holds)
             for clause in record.intent
         ),
+        difficulty=None
+        if record.difficulty is None
+        else Difficulty(**msgspec.structs.asdict(record.difficulty)),
     )
 
 

@@ -55,6 +55,14 @@ def run_evaluation(*arguments):
             ("--bench=eai-native", "--baseline=human", "--tasks=3"),
             "is measured as a whole: leave out --split",
         ),
+        (
+            ("--baseline=oracle", "--bench=DATASET", "--training=DATASET"),
+            "--training is for the baselines template and nearest: leave it out",
+        ),
+        (
+            ("--baseline=nearest", "--bench=DATASET", "--training=OUT/none"),
+            "there is no dataset in OUT/none",
+        ),
         (("--answers=OUT/none",), "none can't be read (No such file or directory)"),
         (("--baseline=oracle", "--settings=OUT/none"), "none can't be read (No such file or directory)"),
     ],

@@ -18,6 +18,7 @@ from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.world.codec_task import task_to_json
 from embomatrix.world.dataset import SPLITS, TaskRecord, record_to_json
+from embomatrix.world.difficulty import Difficulty
 from embomatrix.world.intent import IntentClause
 from embomatrix.world.task import MAX_TABLE, Profile, TaskCategory
 
@@ -49,7 +50,8 @@ def test_fields_of_records_and_tasks_stand_there():
     task = replace(imported().task, profile=Profile.HOUSEHOLD)
     oracle = tuple(plan_to_json((SkillCall(Skill.MOVE, object_index=0),)))
     intent = (IntentClause("hot", ("apple_1",), ("microwave_1",)),)
-    record = TaskRecord(task, "sha256:", "train", oracle, ("kitchen_0",), "", intent=intent)
+    difficulty = Difficulty(template=True, nearest=False, greedy=True, steps=1)
+    record = TaskRecord(task, "sha256:", "train", oracle, ("kitchen_0",), "", intent, difficulty)
     assert list(rows("field of a record")) == list(record_to_json(record))
     assert list(rows("field of a task")) == list(task_to_json(task))
     assert f"at most {MAX_TABLE} names" in rows("field of a task")["table"]

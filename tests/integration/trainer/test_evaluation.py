@@ -16,14 +16,16 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.answer_sources import ask_endpoint, ask_script, questions_digest
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup, read_answers
-from embomatrix.trainer.evaluation.baselines import PLANNERS, BaselineName
+from embomatrix.trainer.evaluation.baselines import PLANNERS, BaselineName, fitted_scripts
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
-from embomatrix.trainer.evaluation.exam import WorldExam
+from embomatrix.trainer.evaluation.exam import WorldExam, success_by_level
 from embomatrix.trainer.evaluation.judging import judge_answers
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
 from embomatrix.worker.slots.rollout_pool import RolloutPool
+from embomatrix.world.dataset import Dataset
+from embomatrix.world.difficulty import Difficulty
 from embomatrix.world.task import Profile
 
 APPLE = "apple_to_counter"
@@ -93,6 +95,39 @@ def test_oracle_succeeds_everywhere_and_random_plans_parse(bench):
 def test_greedy_baseline_solves_tasks_without_dependencies(bench):
     found, _ = judged(bench, asked(bench, BaselineName.GREEDY))
     assert {verdict.task_id: verdict.success for verdict in found.verdicts}[APPLE]
+
+
+def test_measured_difficulty_splits_the_success_and_leaves_the_digest(bench):
+    measured = [
+        replace(record, difficulty=Difficulty(True, at % 2 == 0, True, len(record.oracle)))
+        for at, record in enumerate(bench.records)
+    ]
+    other = replace(bench, records=tuple(measured))
+    assert other.digest == bench.digest
+    found, _ = judged(bench, asked(bench, BaselineName.ORACLE))
+    board = Scoreboard.of(categories(bench), found.verdicts)
+    by_level = success_by_level(measured, board)
+    assert list(by_level) == ["success on easy tasks (2)", "success on medium tasks (2)"]
+    assert [estimate.interval.value for estimate in by_level.values()] == [1.0, 1.0]
+    assert success_by_level(bench.records, board) == {}
+
+
+@pytest.mark.parametrize("name", [BaselineName.TEMPLATE, BaselineName.NEAREST])
+def test_scripts_write_executable_plans_for_tasks_that_they_never_saw(bench, name):
+    scripts = fitted_scripts(name, Dataset.load(bench.folder))
+    answers = [
+        Answer(task_id, 0, json.dumps(plan_to_json(scripts.plan(task_id, task.situation))))
+        for task_id, task in bench.tasks.items()
+    ]
+    found, _ = judged(bench, answers)
+    assert len(found.plans) == len(bench.records)
+    assert not any(verdict.lost for verdict in found.verdicts)
+
+
+def test_scripts_need_training_tasks(bench):
+    heldout = Dataset(bench.folder, Dataset.load(bench.folder).heldout)
+    with pytest.raises(TrainerError, match="pass a dataset that has some with --training"):
+        fitted_scripts(BaselineName.NEAREST, heldout)
 
 
 def test_each_kind_of_answer_gets_its_verdict(bench):

@@ -14,8 +14,8 @@ from embomatrix.factory.metrics.diversity import (
     near_duplicates,
     normalised_entropy,
     self_bleu,
-    words_of,
 )
+from embomatrix.scripts.similarity import words_in
 
 TEXTS = st.lists(
     st.lists(st.sampled_from("abcdef"), min_size=1, max_size=8).map(tuple), min_size=2, max_size=6
@@ -23,7 +23,7 @@ TEXTS = st.lists(
 
 
 def test_words_are_lower_case_and_split_at_underscores():
-    assert words_of("Put Mia's apple in the top_cabinet_0, please!") == (
+    assert words_in("Put Mia's apple in the top_cabinet_0, please!") == (
         "put", "mia's", "apple", "in", "the", "top", "cabinet", "0", "please",
     )  # fmt: skip
 

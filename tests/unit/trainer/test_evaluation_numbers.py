@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from embomatrix.pages.figures import wilson
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import PlanReason, parse_plan
 from embomatrix.skills.trace import Step
 from embomatrix.skills.view import refuse
-from embomatrix.trainer.evaluation.intervals import IntervalMethod, mean_over_tasks, pass_at, wilson
+from embomatrix.trainer.evaluation.intervals import IntervalMethod, mean_over_tasks, pass_at
 from embomatrix.trainer.evaluation.taxonomy import (
     MEANINGS,
     PLAN_CAUSES,

@@ -1,6 +1,7 @@
 """Datasets survive the disk, read bundles on demand, and explain damaged folders."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,11 @@ from embomatrix.world.dataset import (
     Dataset,
     DatasetError,
     TaskRecord,
+    encode_records,
     record_to_json,
     write_dataset,
 )
+from embomatrix.world.difficulty import Difficulty, DifficultyLevel
 from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.task import Task
 
@@ -112,3 +115,33 @@ def test_record_with_a_malformed_digest_is_named_by_its_line(
     tasks.write_text(tasks.read_text().replace(record.bundle_digest, digest))
     with pytest.raises(DatasetError, match=r"tasks.jsonl:1 is damaged: .*bundle.* 64 hexadecimal digits"):
         Dataset.load(tmp_path)
+
+
+def test_measured_difficulty_survives_the_disk(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    record = write(tmp_path, bundle, task)
+    assert "difficulty" not in record_to_json(record)
+    measured = replace(record, difficulty=Difficulty(True, False, True, 2, 0.25))
+    (tmp_path / TASKS_FILE).write_bytes(encode_records([measured]))
+    assert Dataset.load(tmp_path).records == (measured,)
+
+
+def test_difficulty_of_impossible_values_names_the_field(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    measured = replace(write(tmp_path, bundle, task), difficulty=Difficulty(True, True, True, 2, 1.5))
+    (tmp_path / TASKS_FILE).write_bytes(encode_records([measured]))
+    with pytest.raises(DatasetError, match=r"difficulty\.small_policy"):
+        Dataset.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("nearest", "template", "level"),
+    [
+        (True, True, DifficultyLevel.EASY),
+        (True, False, DifficultyLevel.EASY),
+        (False, True, DifficultyLevel.MEDIUM),
+        (False, False, DifficultyLevel.HARD),
+    ],
+)
+def test_level_is_that_of_the_weakest_script_that_succeeds(
+    nearest: bool, template: bool, level: DifficultyLevel
+) -> None:
+    assert Difficulty(template, nearest, True, 4).level is level

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE, Design
-from embomatrix.pages.figures import Better, Figure
-from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
+from embomatrix.pages.figures import Better, Figure, Interval
+from embomatrix.trainer.evaluation.intervals import bootstrap
 from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 

@@ -13,6 +13,7 @@ from embomatrix.factory.commands.agents import agent
 from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.build import make_dataset
 from embomatrix.factory.commands.corpus import corpus
+from embomatrix.factory.commands.difficulty import difficulty
 from embomatrix.factory.commands.evaluate import evaluate
 from embomatrix.factory.commands.faithfulness import audit
 from embomatrix.factory.commands.inspection import inspect, pictures
@@ -36,6 +37,7 @@ from embomatrix.factory.commands.verification import verify
 from embomatrix.factory.days.maker import DAYS, days_planned_by
 from embomatrix.factory.days.model_days import ModelDays
 from embomatrix.factory.days.planning import plan_day
+from embomatrix.factory.evaluate.readings import prompts_of
 from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
@@ -50,7 +52,7 @@ from embomatrix.world.whole_file import write_whole
 app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
-for command in (agent, lay, inspect, pictures, corpus, merge, verify, audit, evaluate):
+for command in (agent, lay, inspect, pictures, corpus, merge, verify, audit, evaluate, difficulty):
     app.command()(command)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
@@ -195,13 +197,41 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
     with user_errors():
         dataset = Dataset.load(folder)
     # Other commands take the task's id as an argument, so the column never truncates it.
-    columns = (Column("task", no_wrap=True), "split", "category", "rows", "steps", "instruction")
+    columns = (
+        Column("task", no_wrap=True),
+        "split",
+        "category",
+        "rows",
+        "steps",
+        "difficulty",
+        "instruction",
+    )
     rows = (
-        (task.task_id, record.split, task.category, len(task.table), len(record.oracle), task.instruction)
+        (
+            task.task_id,
+            record.split,
+            task.category,
+            len(task.table),
+            len(record.oracle),
+            "" if record.difficulty is None else record.difficulty.level,
+            task.instruction,
+        )
         for record in dataset.records
         for task in (record.task,)
     )
     show_table(columns, rows)
+
+
+@app.command()
+def prompts(
+    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
+    out: Annotated[Path, typer.Option(help="Text file to write.")],
+    tasks: Annotated[int, typer.Option(min=1, help="Number of held-out tasks.")] = 40,
+) -> None:
+    """Write the prompts of held-out tasks, without their goals, for a person or a model to answer."""
+    with user_errors(out):
+        write_whole(out, prompts_of(Dataset.load(folder), tasks).encode("utf-8"))
+    say(f"prompts: {out}; `factory evaluate readings` judges the answers")
 
 
 @app.command()

@@ -20,7 +20,9 @@ from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.lies import evaluate_lies
 from embomatrix.factory.evaluate.page import with_factory
+from embomatrix.factory.evaluate.readings import evaluate_readings, read_answers
 from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
+from embomatrix.factory.evaluate.scripts import evaluate_scripts
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -40,14 +42,18 @@ def evaluate(
     parts: Annotated[
         list[str],
         typer.Argument(
-            help="Parts to measure: tasks, scenes, looks, admission, lies, aesthetics. A .json file of figures is read instead."
+            help="Parts: tasks, scripts, readings, scenes, looks, admission, lies, aesthetics; or a .json file of figures."
         ),
     ],
     dataset: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset for the parts tasks and admission. Default for tasks: draft tasks with both writers."
+            help="Dataset for the parts tasks, scripts and admission. Default for tasks: draft tasks with both writers."
         ),
+    ] = None,
+    training: Annotated[
+        Path | None,
+        typer.Option(help="Dataset whose training tasks the scripts learn from. Default: that of --dataset."),
     ] = None,
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
     sample: Annotated[
@@ -59,7 +65,11 @@ def evaluate(
         Path | None,
         typer.Option(help="JSON lines file for the outcomes of scenes; an interrupted run resumes from it."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes and scripts.")] = 1,
+    answers: Annotated[
+        Path | None,
+        typer.Option(help="JSON lines file with the answers of a reader of prompts, for readings."),
+    ] = None,
     rooms: Annotated[
         Path | None, typer.Option(help="Gzipped JSON file with hand-made rooms, for aesthetics.")
     ] = None,
@@ -76,17 +86,21 @@ def evaluate(
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
     ] = None,
 ) -> None:
-    """Measure parts of the factory: diversity of tasks, layouts of fixed tasks, admission, lies, aesthetics.
+    """Measure parts of the factory: tasks, scripts, answers of readers, layouts of fixed tasks, admission, lies, aesthetics.
 
     A language model judges looks, and also tasks if one is given.
     """
     judge = partial(chat_model, llm, model, key, cassette)
     measures: Mapping[str, Callable[[], EvaluationFigures]] = {
         "tasks": lambda: _tasks(dataset, each, seed, judge() if llm or cassette else None),
+        "scripts": lambda: evaluate_scripts(
+            _given(dataset, "--dataset FOLDER"), training, jobs=jobs, counter=counter
+        ),
         "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes),
         "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
         "lies": evaluate_lies,
+        "readings": lambda: _readings(_given(dataset, "--dataset FOLDER"), _given(answers, "--answers FILE")),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
     check_output(page)
@@ -116,6 +130,15 @@ def _given(path: Path | None, option: str) -> Path:
     if path is None:
         raise EvaluationError(f"an input of this part is missing: give {option}")
     return path
+
+
+def _readings(dataset: Path, answers: Path) -> EvaluationFigures:
+    """Judge the answers of a reader, and print those that failed."""
+    evaluation, verdicts = evaluate_readings(Dataset.load(dataset), read_answers(answers))
+    for verdict in verdicts:
+        if verdict.success is False or verdict.agrees is False:
+            say(f"{verdict.task}: {verdict.detail}")
+    return evaluation
 
 
 def _fixed(sample: Path | None) -> list[SourceText]:

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from embomatrix.factory.days.laying import SOURCE
-from embomatrix.factory.faithfulness.clauses import goal_clauses
 from embomatrix.factory.language.clauses import PhraseBook
 from embomatrix.factory.language.references import Describer
 from embomatrix.factory.scenes.view import SceneView
@@ -25,6 +24,7 @@ from embomatrix.factory.writer.tasks import Draft, object_table
 from embomatrix.factory.writer.words import FreshVoice
 from embomatrix.skills.prompt import situation_of
 from embomatrix.world.evaluate import render, types_of
+from embomatrix.world.intent import goal_clauses
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 

@@ -14,7 +14,6 @@ from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.days.drafts import Members, PlannedTask, task_of
 from embomatrix.factory.days.laying import lay_out
 from embomatrix.factory.days.planning import PlannedDay, day_name
-from embomatrix.factory.faithfulness.clauses import goal_clauses
 from embomatrix.factory.language.nouns import noun_of
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.variants import VariantOrder
@@ -24,6 +23,7 @@ from embomatrix.factory.social.scene_kinds import kinds_of
 from embomatrix.factory.social.written import WrittenRequest
 from embomatrix.factory.task_import.task_fields import signature_of
 from embomatrix.factory.writer.tasks import Draft
+from embomatrix.world.intent import goal_clauses
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 

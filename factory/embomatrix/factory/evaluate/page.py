@@ -24,6 +24,12 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "as shares of the largest possible entropy. *plain* is the writer without social simulation. These figures depend on "
         "the number of instructions, so compare only equal numbers. None is on the scale of the paper's judge.",
     ),
+    "scripts": (
+        "Success of scripts",
+        "`embomatrix factory evaluate scripts --dataset DATASET` executes the plans of scripts on the held-out tasks. "
+        "*template* knows all phrases of the training split, *nearest* copies the demands of the most similar training "
+        "instruction, *greedy* knows the goal. A small share means that the words need more than a table of phrases.",
+    ),
     "admission": (
         "Admission",
         "`embomatrix factory evaluate admission --dataset DATASET` reads the ledger of a build. *admitted_per_hour* is "

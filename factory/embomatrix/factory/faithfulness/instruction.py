@@ -9,11 +9,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
-from embomatrix.factory.faithfulness.clauses import goal_clauses
 from embomatrix.factory.language.nouns import everyday_noun
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.words import spoken
-from embomatrix.world.intent import IntentClause
+from embomatrix.world.intent import IntentClause, goal_clauses
 from embomatrix.world.state import THERMAL, Relation, State
 from embomatrix.world.task import Task
 

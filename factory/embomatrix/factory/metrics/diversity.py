@@ -9,23 +9,17 @@ from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Final
 
+from embomatrix.scripts.similarity import TermIndex, Words, cosine, ngrams, words_in
+
 NEAR: Final = 0.9
 """Cosine similarity above which two instructions are near-duplicates."""
 SMOOTHING: Final = 0.1
 """Replacement for n-gram counts of 0: method 1 of Chen and Cherry (2014)."""
-_WORD: Final = re.compile(r"[a-z0-9]+(?:'[a-z]+)?")
-
-Words = tuple[str, ...]
-
-
-def words_of(text: str) -> Words:
-    """Return lower-case words; underscores separate words."""
-    return tuple(_WORD.findall(text.lower().replace("_", " ")))
 
 
 def distinct(texts: Sequence[Words], n: int) -> float:
     """Return the share of distinct n-grams (Li et al. 2016); 0 without n-grams."""
-    grams = [gram for words in texts for gram in _grams(words, n)]
+    grams = [gram for words in texts for gram in ngrams(words, n)]
     return len(set(grams)) / len(grams) if grams else 0.0
 
 
@@ -44,12 +38,12 @@ def bleu(words: Words, references: Sequence[Words], n: int = 4) -> float:
     """Return the geometric mean of clipped 1- to n-gram precisions with the brevity penalty (Papineni et al. 2002)."""
     logs = []
     for size in range(1, n + 1):
-        counts = Counter(_grams(words, size))
+        counts = Counter(ngrams(words, size))
         if not counts:
             break
         most: Counter[Words] = Counter()
         for reference in references:
-            most |= Counter(_grams(reference, size))
+            most |= Counter(ngrams(reference, size))
         matched = sum(min(count, most[gram]) for gram, count in counts.items())
         logs.append(math.log((matched or SMOOTHING) / counts.total()))
     if not logs:
@@ -71,9 +65,9 @@ def normalised_entropy(values: Collection[Hashable]) -> float:
 
 def near_duplicates(texts: Sequence[Words], near: float = NEAR) -> float:
     """Return the share of texts similar to an earlier one, by the cosine of TF-IDF weights of words and word pairs."""
-    vectors = _weighted(texts)
+    vectors = TermIndex(texts).vectors
     copies = sum(
-        any(_cosine(vector, earlier) > near for earlier in vectors[:number])
+        any(cosine(vector, earlier) > near for earlier in vectors[:number])
         for number, vector in enumerate(vectors)
     )
     return copies / len(texts) if texts else 0.0
@@ -93,7 +87,7 @@ def diversity(
 
     Figures are means over the scenes, except those of names, signatures, verbs and words, which are over all tasks.
     """
-    groups = [[words_of(text) for text in texts] for texts in instructions.values() if texts]
+    groups = [[words_in(text) for text in texts] for texts in instructions.values() if texts]
     texts = [text for found in instructions.values() for text in found]
     every = [words for group in groups for words in group]
     return {
@@ -106,23 +100,6 @@ def diversity(
         "verb_entropy": normalised_entropy([words[0] for words in every if words]),
         "words": _mean([len(words) for words in every]),
     }
-
-
-def _grams(words: Words, n: int) -> list[Words]:
-    return [words[at : at + n] for at in range(len(words) - n + 1)]
-
-
-def _weighted(texts: Sequence[Words]) -> list[dict[Words, float]]:
-    counts = [Counter([*_grams(words, 1), *_grams(words, 2)]) for words in texts]
-    seen: Counter[Words] = Counter(gram for count in counts for gram in count)
-    rarity = {gram: math.log((1 + len(texts)) / (1 + number)) + 1 for gram, number in seen.items()}
-    return [{gram: number * rarity[gram] for gram, number in count.items()} for count in counts]
-
-
-def _cosine(one: Mapping[Words, float], other: Mapping[Words, float]) -> float:
-    shared = sum(weight * other.get(gram, 0.0) for gram, weight in one.items())
-    length = math.sqrt(sum(w * w for w in one.values()) * sum(w * w for w in other.values()))
-    return shared / length if length else 0.0
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -7,14 +7,14 @@ other. More than half of Internal-Verified lies in six scenes that training neve
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, write_dataset
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord, encode_records, write_dataset
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
@@ -121,8 +121,8 @@ def check_frozen(folder: Path) -> Frozen:
 
 
 def _frozen(folder: Path, trained_in: set[str]) -> Frozen:
-    data = (folder / TASKS_FILE).read_bytes()
     records = Dataset.load(folder).records
+    data = encode_records(replace(record, difficulty=None) for record in records)
     bases = tuple(sorted({base_scene_of(record.task.scene_id) for record in records}))
     unseen = sum(base_scene_of(record.task.scene_id) not in trained_in for record in records)
     return Frozen(len(records), unseen, bases, f"sha256:{hashlib.sha256(data).hexdigest()}")

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -29,7 +29,8 @@ NAMED: Final[Mapping[str, str]] = {
 class Benchmark:
     """Tasks in the order of their file. ``failed_by_rule``: tasks that were rejected or that the skills can't express.
 
-    These count as failures in the success over all tasks, and are left out of all other figures.
+    These count as failures in the success over all tasks, and are left out of all other figures. ``file_records`` are all
+    records of the file.
     """
 
     name: str
@@ -37,13 +38,18 @@ class Benchmark:
     split: str
     records: tuple[TaskRecord, ...]
     failed_by_rule: frozenset[str] = frozenset()
+    file_records: tuple[TaskRecord, ...] = ()
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the tasks, goals, tables and scenes. Equal benchmarks have equal digests in any folder."""
+        """SHA-256 of the tasks, goals, tables and scenes. Equal benchmarks have equal digests in any folder.
+
+        Measured difficulties are not part of it.
+        """
         content = hashlib.sha256()
         for record in self.records:
-            content.update(json.dumps(record_to_json(record), sort_keys=True).encode())
+            measured = replace(record, difficulty=None)
+            content.update(json.dumps(record_to_json(measured), sort_keys=True).encode())
         for task_id in sorted(self.failed_by_rule):
             content.update(task_id.encode())
         return f"sha256:{content.hexdigest()}"
@@ -52,6 +58,11 @@ class Benchmark:
     def dataset(self) -> Dataset:
         """Dataset with the bundles."""
         return Dataset(self.folder, self.records)
+
+    @property
+    def training(self) -> Dataset:
+        """Dataset whose training split scripts learn from."""
+        return Dataset(self.folder, self.file_records)
 
     @cached_property
     def tasks(self) -> Mapping[str, TrainingTask]:
@@ -92,7 +103,12 @@ def find_benchmark(
             f"no task of {path} can be solved with the skills of the profile {profile}: pass another --profile"
         )
     return Benchmark(
-        named, folder, found_split, tuple(within[:limit]), frozenset(inexpressible | _rejected(folder))
+        named,
+        folder,
+        found_split,
+        tuple(within[:limit]),
+        frozenset(inexpressible | _rejected(folder)),
+        records,
     )
 
 

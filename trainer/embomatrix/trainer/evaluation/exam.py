@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 from embomatrix.skills.prompt import Codec, Prompt, limited, prompt_for
 from embomatrix.trainer.cluster.executor import Executor
 from embomatrix.trainer.evaluation.benchmark import Benchmark
-from embomatrix.trainer.evaluation.intervals import Estimate
+from embomatrix.trainer.evaluation.intervals import Estimate, mean_over_tasks
 from embomatrix.trainer.evaluation.judging import judge_answers
 from embomatrix.trainer.evaluation.pictures import Picture, chosen_pictures
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
+from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.difficulty import DifficultyLevel
 
 if TYPE_CHECKING:
     from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
@@ -62,4 +64,21 @@ class WorldExam:
         judged = judge_answers(self.bench, setup, self._executor, answers, report)
         categories = {record.task.task_id: record.task.category for record in self.bench.records}
         board = Scoreboard.of(categories, judged.verdicts, self.by_rule)
-        return ExamResult(board, chosen_pictures(self.bench, board, judged.plans))
+        by_level = success_by_level(self.bench.records, board)
+        return ExamResult(board, chosen_pictures(self.bench, board, judged.plans), by_level)
+
+
+def success_by_level(records: Sequence[TaskRecord], board: Scoreboard) -> dict[str, Estimate]:
+    """Return the success on tasks of each difficulty level, by the name of the figure. Tasks without a level are left out."""
+    levels = {
+        record.task.task_id: record.difficulty.level for record in records if record.difficulty is not None
+    }
+    rates = {
+        level: [task.rate for task in board.tasks if levels.get(task.task_id) is level]
+        for level in DifficultyLevel
+    }
+    return {
+        f"success on {level} tasks ({len(found)})": mean_over_tasks(found)
+        for level, found in rates.items()
+        if found
+    }

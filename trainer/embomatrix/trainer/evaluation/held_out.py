@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from embomatrix.pages.figures import Interval
 from embomatrix.trainer.cluster.gateway import Gateway, PlanGroup, PlanOutcome, result_of
 from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
-from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
+from embomatrix.trainer.evaluation.intervals import bootstrap
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
 

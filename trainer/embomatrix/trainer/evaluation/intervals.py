@@ -8,22 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from embomatrix.pages.figures import Interval, wilson
+
 RESAMPLES: Final = 4000
 LEVEL: Final = 0.95
-_Z: Final = 1.959963984540054
-"""Quantile of the standard normal distribution at (1 + LEVEL) / 2."""
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Estimate with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def as_percent(self) -> str:
-        return f"{self.value:.1%} [{self.low:.1%}, {self.high:.1%}]"
 
 
 class IntervalMethod(StrEnum):
@@ -55,14 +43,6 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
     means = known[draws].mean(axis=1)  # (resamples,)
     low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Interval(float(known.mean()), float(low), float(high))
-
-
-def wilson(share: float, count: int) -> Interval:
-    """Wilson score interval (1927) of a share of ``count`` >= 1 independent trials."""
-    middle = share + _Z**2 / (2 * count)
-    spread = _Z * math.sqrt(share * (1 - share) / count + _Z**2 / (4 * count**2))
-    scale = 1 + _Z**2 / count
-    return Interval(share, max(0.0, (middle - spread) / scale), min(1.0, (middle + spread) / scale))
 
 
 def mean_over_tasks(shares: Sequence[float]) -> Estimate:

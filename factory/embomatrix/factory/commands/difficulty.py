@@ -1,0 +1,98 @@
+"""``embomatrix factory difficulty``: measure the difficulty of each task of a dataset, and select tasks by it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from embomatrix.factory.commands.options import Jobs, processes
+from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
+from embomatrix.factory.evaluate.difficulty import (
+    level_counts,
+    read_policy_shares,
+    selected,
+    shares_of,
+    with_policy,
+    with_scripts,
+)
+from embomatrix.factory.evaluate.scripts import ScriptResults, run_scripts, write_plans
+from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, TaskRecord, encode_records, write_dataset
+from embomatrix.world.difficulty import DifficultyLevel
+from embomatrix.world.whole_file import write_whole
+
+
+def difficulty(
+    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
+    training: Annotated[
+        Path | None,
+        typer.Option(
+            help="Dataset whose training tasks the scripts learn from. Default: the dataset itself."
+        ),
+    ] = None,
+    policy: Annotated[
+        Path | None,
+        typer.Option(help="report.json of `embomatrix eval` for a small policy on the dataset's tasks."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for a selection of tasks by the shares of their levels.")
+    ] = None,
+    easy_share: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Share of easy tasks in the selection.")
+    ] = None,
+    hard_share: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Share of hard tasks in the selection.")
+    ] = None,
+    split: Annotated[
+        str, typer.Option(help="Select from this split only, train or heldout; the other one is kept whole.")
+    ] = "",
+    again: Annotated[
+        bool, typer.Option("--again", help="Also measure tasks that have a difficulty.")
+    ] = False,
+    jobs: Jobs = None,
+) -> None:
+    """Execute scripts on the tasks and store each task's difficulty in tasks.jsonl.
+
+    easy: the nearest training instruction's demands solve the task. medium: only the script with all training phrases does.
+    hard: neither does. With --out, the largest set of tasks with the given shares is written as a dataset of its own.
+    """
+    if (out is None) != (easy_share is None and hard_share is None):
+        fail(
+            "--out and the shares belong together: give --out FOLDER with --easy-share, --hard-share or both"
+        )
+    if split and split not in SPLITS:
+        fail(f"unknown split {split!r}: expected {' or '.join(SPLITS)}")
+    with user_errors(out or folder):
+        shares = shares_of(easy_share, hard_share)
+        shares_of_policy = read_policy_shares(policy) if policy is not None else {}
+        dataset = Dataset.load(folder)
+        missing = [record for record in dataset.records if again or record.difficulty is None]
+        results = _results(dataset, missing, dataset if training is None else Dataset.load(training), jobs)
+        records = with_policy(with_scripts(dataset.records, results), shares_of_policy)
+        write_whole(folder / TASKS_FILE, encode_records(records))
+        _print_levels(records)
+        if out is not None:
+            chosen = selected(records, shares, (split,) if split else SPLITS)
+            digests = dict.fromkeys(record.bundle_digest for record in chosen)
+            write_dataset(out, chosen, {digest: dataset.bundle_bytes(digest) for digest in digests})
+            _print_levels(chosen)
+            say(f"{len(chosen)} of {len(records)} tasks: {out}")
+
+
+def _results(
+    dataset: Dataset, records: Sequence[TaskRecord], training: Dataset, jobs: int | None
+) -> ScriptResults:
+    if not records:
+        return {}
+    plans = write_plans(dataset, records, training)
+    with counter("tasks", len(records)) as count:
+        return run_scripts(dataset, records, plans, jobs=processes(jobs), progress=count)
+
+
+def _print_levels(records: Sequence[TaskRecord]) -> None:
+    """Print the number of tasks of each level by split."""
+    counts = level_counts(records)
+    show_table(
+        ("difficulty", "train", "held out"),
+        [(level, *(counted[level] for counted in counts.values())) for level in DifficultyLevel],
+    )
