@@ -19,7 +19,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
 from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, Pose, Shape
-from embomatrix.world.scene import Room, Scene, SceneObject
+from embomatrix.world.scene import BackgroundObject, Room, Scene, SceneObject
 from embomatrix.world.state import Relation, State
 
 _ON_FLOOR_M: Final = 0.05
@@ -80,6 +80,11 @@ class SceneEditor:
     def objects(self) -> Mapping[str, SceneObject]:
         """Current objects by name, in scene order."""
         return self._objects
+
+    @property
+    def background(self) -> tuple[BackgroundObject, ...]:
+        """Background objects of the base scene whose host is still there."""
+        return tuple(item for item in self.base.background if not item.host or item.host in self._objects)
 
     def known(self, name: str) -> SceneObject:
         """Return an object. Raise PlacementError for an unknown name."""
@@ -218,16 +223,22 @@ class SceneEditor:
 
     def freeze(self, scene_id: str) -> Scene:
         """Return the current scene with the assets that it uses."""
-        objects = tuple(self._objects.values())
-        used = {item.asset_id: self._assets[item.asset_id] for item in objects}
-        return replace(self.base, scene_id=scene_id, objects=objects, assets=used)
+        scene = self._as_scene()
+        used = {item.asset_id for item in scene.objects} | {item.asset_id for item in scene.background}
+        assets = {key: asset for key, asset in self._assets.items() if key in used}
+        return replace(scene, scene_id=scene_id, assets=assets)
 
     def _new_name(self, asset: Asset) -> str:
         self._counts[asset.category] += 1
         return f"{asset.category}_{self._counts[asset.category]}"
 
     def _as_scene(self) -> Scene:
-        return replace(self.base, objects=tuple(self._objects.values()), assets=self._assets)
+        return replace(
+            self.base,
+            objects=tuple(self._objects.values()),
+            background=self.background,
+            assets=self._assets,
+        )
 
     def _refresh(self, changed: Mapping[str, object]) -> None:
         for name in changed:
@@ -250,7 +261,7 @@ class SceneEditor:
             return False
         item = SceneObject("candidate", asset.asset_id, room, pose, fixed=False)
         assets = {**self._assets, asset.asset_id: asset}
-        trial = replace(self.base, objects=(*self._objects.values(), item), assets=assets)
+        trial = replace(self.base, objects=(*self._objects.values(), item), background=(), assets=assets)
         known = self._unreached | {(name,) for name in self.given_up}
         return {problem.names for problem in reach_problems(trial)} <= known
 
