@@ -46,6 +46,8 @@ ROW: Final = (4, 9)
 """Numbers of books in a row."""
 SHELF_HOLDS: Final = 6
 """Objects that a further shelf is worth."""
+SHELF_TRIES: Final = 4
+"""Models of a shelf that are tried: a short one fits where a long one does not."""
 MOST_PICTURES: Final = 5
 ROUNDS: Final = (1, 2, 3)
 """Multiples of the mean number of a category that a room holds at most; shelves are added between the rounds."""
@@ -69,7 +71,7 @@ def with_background(scene: Scene) -> Scene:
             filling = RoomFilling(scene, room, shares, taken, models, rng)
             filling.fill()
             found += filling.placed
-            assets |= filling.assets
+            assets = filling.assets | assets
     return replace(scene, background=tuple(found), assets=assets)
 
 
@@ -88,11 +90,11 @@ class RoomFilling:
         self.placed: list[BackgroundObject] = []
         self.assets: dict[str, Asset] = {}
         self._room = room
-        self._taken = taken
+        self._taken = taken.within(room)
         self._models = models
         self._rng = rng
         mine = [item for item in scene.objects if item.room == room.name and not item.absent]
-        self._low = TakenSpace(
+        self._low = TakenSpace.of(
             scene.box_of(item.name)
             for item in mine
             if item.fixed
@@ -186,23 +188,28 @@ class RoomFilling:
         return [self._surfaces[i] for i in order if weights[i] > 0 and not self._surfaces[i].is_full]
 
     def _add_shelf(self) -> bool:
-        """Hang a shelf on a wall; its boards become surfaces."""
-        asset = self._models.pick(ANY_SHELF)
-        if asset is None or not self._hang_shelf(asset):
+        """Hang a shelf on a wall, with a row of books if books belong in the room. Its top becomes a surface."""
+        asset = next((shelf for _ in range(SHELF_TRIES) if (shelf := self._hung_shelf())), None)
+        if asset is None:
             return False
+        # A background object collides as its bounding box, so only the top of a shelf holds others.
+        top = max(asset.supports, key=lambda surface: surface.center_m[2])
         pose = self.placed[-1].pose_world_asset
-        boards = [s for s in asset.supports if not s.link]
-        self._surfaces = [
-            free_surface("", asset, pose, s, SHELF_FILLED, self._rng) for s in boards
-        ] + self._surfaces
+        board = free_surface("", asset, pose, top, SHELF_FILLED, self._rng)
+        self._surfaces.insert(0, board)
+        if not BOOKS.isdisjoint(self._wishes):
+            self._put_books(board)
         return True
 
-    def _hang_shelf(self, asset: Asset) -> bool:
-        spot = spot_on_wall(self._room, asset, self._taken, self._low, self._rng)
-        if spot is None:
-            return False
+    def _hung_shelf(self) -> Asset | None:
+        asset = self._models.pick(ANY_SHELF)
+        spot = (
+            spot_on_wall(self._room, asset, self._taken, self._low, self._rng) if asset is not None else None
+        )
+        if asset is None or spot is None:
+            return None
         self._add(asset, *spot, "")
-        return True
+        return asset
 
     def _add(self, asset: Asset, pose: Pose, box: Aabb, host: str) -> None:
         self.placed.append(BackgroundObject(asset.asset_id, self._room.name, pose, host))

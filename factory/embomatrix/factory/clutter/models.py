@@ -10,16 +10,8 @@ from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog, Model
 from embomatrix.world.geometry import Vec3
 
-FEW: Final = 2
-MANY: Final = 6
-_MODELS: Final[Mapping[str, int]] = {
-    "hardback": MANY,
-    "painting": MANY,
-    "paperback_book": 3,
-    "picture": 3,
-    "vase": 3,
-}
-"""Models of a category in one scene: a bundle holds every model once."""
+_MODELS: Final[Mapping[str, int]] = {"hardback": 5, "painting": 3, "shelf": 3, "picture": 2, "vase": 2}
+"""Models of a category in one scene, 1 for the others: a bundle holds every model, and loading reads it."""
 _LARGEST_M: Final[Vec3] = (0.35, 0.35, 0.4)
 _LARGEST: Final[Mapping[str, Vec3]] = {
     "painting": (0.05, 1.1, 0.9),
@@ -31,7 +23,7 @@ _LARGEST: Final[Mapping[str, Vec3]] = {
     "towel_rack": (0.05, 0.6, 0.1),
     "bath_towel": (1.2, 0.6, 0.05),
     "hand_towel": (0.3, 0.3, 0.05),
-    "shelf": (0.35, 1.25, 0.3),
+    "shelf": (0.36, 1.6, 0.17),
     "pillow": (0.55, 0.7, 0.25),
     "teddy_bear": (0.35, 0.4, 0.4),
     "laptop": (0.35, 0.45, 0.06),
@@ -46,7 +38,7 @@ _LARGEST: Final[Mapping[str, Vec3]] = {
 _SMALLEST: Final[Mapping[str, Vec3]] = {
     "painting": (0.0, 0.3, 0.24),
     "picture": (0.25, 0.2, 0.0),
-    "shelf": (0.14, 0.4, 0.0),
+    "shelf": (0.14, 0.5, 0.0),
     "mirror": (0.0, 0.3, 0.4),
     "pillow": (0.3, 0.35, 0.08),
     "hardback": (0.15, 0.1, 0.012),
@@ -85,7 +77,7 @@ class ModelShelf:
             for model in self._catalog.models_of(category)
             if all(a <= size <= b for a, size, b in zip(low, model.size_m, high, strict=True))
         ]
-        count = min(_MODELS.get(category, FEW), len(fitting))
+        count = min(_MODELS.get(category, 1), len(fitting))
         return (
             [fitting[int(i)] for i in self._rng.choice(len(fitting), count, replace=False)] if count else []
         )

@@ -1,5 +1,7 @@
 """Space of a scene that background objects may not take: bodies, the paths of doors, room for hands, openings."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 from typing import Final
 
@@ -9,8 +11,8 @@ from numpy.typing import NDArray
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.world.asset import Asset
-from embomatrix.world.geometry import Aabb, Pose
-from embomatrix.world.scene import Scene, SceneObject
+from embomatrix.world.geometry import Aabb, FloatArray, Pose
+from embomatrix.world.scene import Room, Scene, SceneObject
 
 HAND_M: Final = 0.08
 """Free space for the hand around an object that the robot may pick up, and before a device."""
@@ -28,22 +30,32 @@ UNDER_M: Final = 0.0002
 class TakenSpace:
     """Boxes, shape (n, 6), that new objects must stay clear of."""
 
-    def __init__(self, boxes: Iterable[Aabb]) -> None:
-        rows = [(*box.low_m, *box.high_m) for box in boxes]
-        self._rows = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    def __init__(self, rows: FloatArray) -> None:
+        self._rows = rows
 
     @staticmethod
-    def of_scene(scene: Scene) -> "TakenSpace":
+    def of(boxes: Iterable[Aabb]) -> TakenSpace:
+        """Return the space of these boxes."""
+        rows = [(*box.low_m, *box.high_m) for box in boxes]
+        return TakenSpace(np.array(rows, dtype=np.float64).reshape(-1, 6))
+
+    @staticmethod
+    def of_scene(scene: Scene) -> TakenSpace:
         """Return the space of a scene's objects and openings. Walls are not part of it: rooms end before them."""
-        return TakenSpace(
-            (*_openings(scene), *(box for item in scene.objects for box in _around(scene, item)))
-        )
+        bodies = (box for item in scene.objects for box in _around(scene, item))
+        return TakenSpace.of((*_openings(scene), *bodies))
+
+    def within(self, room: Room) -> TakenSpace:
+        """Return the part of this space that reaches into a room."""
+        (x0, y0), (x1, y1), rows = room.low_m, room.high_m, self._rows
+        inside = (rows[:, 0] < x1) & (rows[:, 3] > x0) & (rows[:, 1] < y1) & (rows[:, 4] > y0)
+        return TakenSpace(rows[inside])
 
     def is_free(self, box: Aabb) -> bool:
         """Return True if a box is clear of everything."""
         return bool(self.free(np.array([(*box.low_m, *box.high_m)]))[0])
 
-    def free(self, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def free(self, boxes: FloatArray) -> NDArray[np.bool_]:
         """Mask, (k,), of the boxes, (k, 6), that are clear of everything."""
         gap = np.array([APART_M, APART_M, UNDER_M])
         low, high = boxes[:, None, :3] - gap, boxes[:, None, 3:] + gap  # (k, 1, 3)

@@ -40,6 +40,8 @@ BOOK_GAP_M: Final = 0.002
 ACROSS: Final = 25
 ALONG: Final = 5
 """Candidates along the width of a surface, and from its back to its middle."""
+AT_ONCE: Final = 25
+"""Candidates that are compared together."""
 UPRIGHT_BOOK: Final[Quat] = (-0.5, -0.5, -0.5, 0.5)
 """Rotation that stands a lying book on its short edge, its spine to the front."""
 
@@ -106,8 +108,12 @@ def spot_on(
     local = np.column_stack([(back.ravel() - 0.5) * room[0], (side.ravel() - 0.5) * room[1]])  # (k, 2)
     end = np.array([-0.5 * room[0], surface.anchor * room[1]])
     order = np.argsort(np.hypot(*(local - end).T) + rng.uniform(0.0, 0.06, len(local)))
-    poses = [_on(surface, asset, (float(local[i, 0]), float(local[i, 1])), turn) for i in order]
-    return _first_free(poses, asset, taken)
+    for first in range(0, len(order), AT_ONCE):
+        places = local[order[first : first + AT_ONCE]].tolist()
+        found = _first_free([_on(surface, asset, (x, y), turn) for x, y in places], asset, taken)
+        if found is not None:
+            return found
+    return None
 
 
 def row_of_books(
