@@ -45,8 +45,8 @@ def test_background_breaks_no_rule_of_a_scene(flat) -> None:
 def test_check_finds_a_background_object_in_the_furniture_and_one_in_the_air(flat) -> None:
     table = flat.by_name["coffee_table_1"]
     asset_id = flat.background[0].asset_id
-    inside = BackgroundObject(asset_id, table.room, table.pose_world_asset)
     x, y, _ = table.pose_world_asset.position_m
+    inside = BackgroundObject(asset_id, table.room, Pose((x, y, flat.box_of(table.name).high_m[2])))
     floating = BackgroundObject(asset_id, table.room, Pose((x, y, 1.2)), "coffee_table_1")
     found = check_scene(replace(flat, background=(inside, floating)))
     kinds = {problem.kind for problem in found if problem.names[0] == f"background {asset_id}"}

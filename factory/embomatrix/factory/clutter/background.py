@@ -103,7 +103,7 @@ class RoomFilling:
         self._surfaces = list(surfaces_of(scene, room.name, rng))
         self._counts = Counter(scene.assets[item.asset_id].category for item in mine)
         low, middle, high = shares.quartiles
-        goal = np.interp(rng.uniform(0.35, 0.75), (0.25, 0.5, 0.75), (low, middle, high))
+        goal = np.interp(rng.uniform(0.25, 0.75), (0.25, 0.5, 0.75), (low, middle, high))
         self._missing = max(0, round(float(goal)) - len(mine))
         self._wishes = dict(wanted(room.type))
         if any(surface.category == "bookcase" for surface in self._surfaces):

@@ -28,10 +28,11 @@ UNDER_M: Final = 0.0002
 
 
 class TakenSpace:
-    """Boxes, shape (n, 6), that new objects must stay clear of."""
+    """Boxes, shape (n, 6), that new objects must stay clear of, perhaps in one room."""
 
-    def __init__(self, rows: FloatArray) -> None:
+    def __init__(self, rows: FloatArray, room: Room | None = None) -> None:
         self._rows = rows
+        self._room = room
 
     @staticmethod
     def of(boxes: Iterable[Aabb]) -> TakenSpace:
@@ -49,7 +50,7 @@ class TakenSpace:
         """Return the part of this space that reaches into a room."""
         (x0, y0), (x1, y1), rows = room.low_m, room.high_m, self._rows
         inside = (rows[:, 0] < x1) & (rows[:, 3] > x0) & (rows[:, 1] < y1) & (rows[:, 4] > y0)
-        return TakenSpace(rows[inside])
+        return TakenSpace(rows[inside], room)
 
     def is_free(self, box: Aabb) -> bool:
         """Return True if a box is clear of everything."""
@@ -61,6 +62,13 @@ class TakenSpace:
         low, high = boxes[:, None, :3] - gap, boxes[:, None, 3:] + gap  # (k, 1, 3)
         apart = (self._rows[:, 3:] <= low) | (self._rows[:, :3] >= high)  # (k, n, 3)
         return np.asarray(apart.any(axis=2).all(axis=1))
+
+    def inside(self, boxes: FloatArray) -> NDArray[np.bool_]:
+        """Mask, (k,), of the boxes, (k, 6), that do not reach into the walls of the room."""
+        if self._room is None:
+            return np.ones(len(boxes), dtype=np.bool_)
+        low, high = np.array(self._room.low_m), np.array(self._room.high_m)
+        return np.asarray(((boxes[:, :2] >= low) & (boxes[:, 3:5] <= high)).all(axis=1))
 
     def take(self, box: Aabb) -> None:
         """Add the box of a new object."""

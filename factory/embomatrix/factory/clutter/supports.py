@@ -132,7 +132,8 @@ def row_of_books(
             pose = _lifted(surface, (x, at + sign * thick / 2), height, UPRIGHT_BOOK)
             at += sign * (thick + BOOK_GAP_M)
             box = box_of(book, pose)
-            if taken.is_free(_shrunk(box)):
+            near = _shrunk(box)
+            if taken.is_free(near) and taken.inside(np.array([(*near.low_m, *near.high_m)]))[0]:
                 found.append((book, pose, box))
                 surface.budget_m2 -= thick * depth
                 break
@@ -155,7 +156,7 @@ def _shrunk(box: Aabb) -> Aabb:
 def _first_free(poses: list[Pose], asset: Asset, taken: TakenSpace) -> tuple[Pose, Aabb] | None:
     boxes = [box_of(asset, pose) for pose in poses]
     rows = np.array([(*box.low_m, *box.high_m) for box in boxes])
-    free = np.flatnonzero(taken.free(rows))
+    free = np.flatnonzero(taken.free(rows) & taken.inside(rows))
     return (poses[free[0]], boxes[free[0]]) if len(free) else None
 
 

@@ -72,6 +72,9 @@ Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and objects left out.")
 ]
 Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets that replace generated ones.")]
+Background = Annotated[
+    bool, typer.Option(help="Fill homes with background objects, as many as real rooms hold.")
+]
 CORES = usable_cores()
 _user_errors = partial(user_errors, more=(FloorPlanError, ModelFileError, SceneFileError))
 LEFT_OUT = "for objects that were left out, and why: `embomatrix scene show NAME`, or --report FILE"
@@ -94,6 +97,7 @@ def build(
     report: Report = None,
     jobs: Jobs = CORES,
     assets: Assets = None,
+    background: Background = True,
 ) -> None:
     """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 if one has a problem."""
     chosen = _chosen(scene_ids, every)
@@ -108,7 +112,13 @@ def build(
         out.mkdir(parents=True, exist_ok=True)
     several = len(set(seeds or ())) > 1
     orders = [
-        SceneBuildJob(name, seed, out / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
+        SceneBuildJob(
+            name,
+            seed,
+            out / (f"{name}-{seed}.json" if several else f"{name}.json"),
+            assets,
+            background=background,
+        )
         for name in chosen
         for seed in dict.fromkeys(seeds or (0,))
     ]
