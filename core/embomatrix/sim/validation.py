@@ -35,7 +35,9 @@ def check_scene(scene: Scene) -> None:
                 f"{len(scene.assets)} assets; add it to the scene"
             )
         check_pose(thing.pose_world_asset, thing.asset_id)
-    for asset_id in sorted({item.asset_id for item in (*scene.objects, *scene.background)}):
+    for asset_id in sorted(
+        {*(item.asset_id for item in scene.objects), *(thing.asset_id for thing in scene.background)}
+    ):
         check_asset(scene.assets[asset_id])
 
 

@@ -157,8 +157,9 @@ def show(scene: SceneSource, seed: Seed = 0) -> None:
         doors = [d for d in built.doorways if room.name in d.rooms]
         beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
         windows = sum(room.name in window.rooms for window in built.windows)
-        everything = (*built.objects, *built.background)
-        counts = Counter(built.assets[o.asset_id].category for o in everything if o.room == room.name)
+        mine = [item.asset_id for item in built.objects if item.room == room.name]
+        mine += [item.asset_id for item in built.background if item.room == room.name]
+        counts = Counter(built.assets[asset_id].category for asset_id in mine)
         listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
         size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
         rows.append((room.name, size, ", ".join(beyond), windows, listed))
