@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from embomatrix.factory.clutter.background import with_background
+from embomatrix.factory.clutter.background import with_background, without_covered
 from embomatrix.factory.clutter.shares import all_shares, host_weight, wanted
 from embomatrix.factory.clutter.space import TakenSpace
 from embomatrix.factory.clutter.supports import FILLED, surfaces_of
@@ -94,10 +94,29 @@ def test_removed_furniture_takes_its_background_along(flat) -> None:
     assert all(item.asset_id in left.assets for item in left.background)
 
 
-def test_new_objects_find_no_place_in_the_background(flat) -> None:
+def test_background_gives_way_to_a_new_object(flat) -> None:
     editor = SceneEditor(flat)
-    item = flat.background[0]
-    assert not editor.is_free(flat.assets[item.asset_id], item.pose_world_asset)
+    item = next(each for each in flat.background if flat.assets[each.asset_id].category == "painting")
+    assert editor.is_free(flat.assets[item.asset_id], item.pose_world_asset)
+    editor.insert(flat.assets[item.asset_id], item.pose_world_asset, None, "")
+    assert item in flat.background
+    assert item not in editor.freeze("Rs_int-more").background
+
+
+def test_objects_on_a_removed_background_shelf_go_with_it(flat) -> None:
+    number = next(
+        n for n, each in enumerate(flat.background) if flat.assets[each.asset_id].category == "shelf"
+    )
+    shelf, box = flat.background[number], flat.background_boxes[number]
+    on_it = [
+        each
+        for each, other in zip(flat.background, flat.background_boxes, strict=True)
+        if not each.host and other.overlaps(box, 0.003) and each != shelf
+    ]
+    assert on_it
+    left = without_covered(flat, TakenSpace.of([box]))
+    assert not {shelf, *on_it} & set(left)
+    assert len(left) > len(flat.background) / 2
 
 
 def test_objects_belong_where_real_rooms_have_them() -> None:

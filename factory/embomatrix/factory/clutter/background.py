@@ -54,6 +54,9 @@ ROUNDS: Final = (1, 2, 3)
 REPEATED: Final = 0.35
 """Factor on the wish for a category with each object of it in the room."""
 UPRIGHT_BY: Final = 0.05
+"""Height range in which furniture stands on the floor."""
+STANDS_M: Final = 0.002
+"""Greatest gap between a background object and the one that it stands on."""
 
 
 def with_background(scene: Scene) -> Scene:
@@ -73,6 +76,25 @@ def with_background(scene: Scene) -> Scene:
             found += filling.placed
             assets = filling.assets | assets
     return replace(scene, background=tuple(found), assets=assets)
+
+
+def without_covered(scene: Scene, needed: TakenSpace) -> tuple[BackgroundObject, ...]:
+    """Return the background that neither reaches into a space nor stands on background that does."""
+    things, boxes = scene.background, scene.background_boxes
+    gone = {number for number, box in enumerate(boxes) if not needed.is_free(box)}
+    waiting = list(gone)
+    while waiting:
+        below = boxes[waiting.pop()]
+        standing = Aabb((*below.low_m[:2], below.high_m[2]), (*below.high_m[:2], below.high_m[2] + STANDS_M))
+        above = {
+            n
+            for n, box in enumerate(boxes)
+            if not things[n].host and n not in gone and standing.overlaps(box)
+        }
+        above = {n for n in above if boxes[n].low_m[2] >= below.high_m[2]}
+        gone |= above
+        waiting += sorted(above)
+    return tuple(item for number, item in enumerate(things) if number not in gone)
 
 
 class RoomFilling:

@@ -43,7 +43,7 @@ class TakenSpace:
     @staticmethod
     def of_scene(scene: Scene) -> TakenSpace:
         """Return the space of a scene's objects and openings. Walls are not part of it: rooms end before them."""
-        bodies = (box for item in scene.objects for box in _around(scene, item))
+        bodies = (box for item in scene.objects for box in needed_space(scene.assets[item.asset_id], item))
         return TakenSpace.of((*_openings(scene), *bodies))
 
     def within(self, room: Room) -> TakenSpace:
@@ -83,11 +83,11 @@ def box_of(asset: Asset, pose: Pose) -> Aabb:
     return Aabb((x - a, y - b, z - c), (x + a, y + b, z + c))
 
 
-def _around(scene: Scene, item: SceneObject) -> Iterator[Aabb]:
+def needed_space(asset: Asset, item: SceneObject) -> Iterator[Aabb]:
     """Yield boxes of an object's parts, of its doors on their way, and of the space that a hand needs."""
     if item.absent:
         return
-    asset, pose = scene.assets[item.asset_id], item.pose_world_asset
+    pose = item.pose_world_asset
     bounds = bounds_of(asset)
     yield from bounds.part_boxes(pose, item.joints)
     if asset.joints:

@@ -151,9 +151,6 @@ def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[P
     half = half_extents(np.asarray(plane.pose.yaw), plane.size_m)  # (2,)
     x, y, _ = plane.pose.position_m
     low, high = (x - half[0], y - half[1]), (x + half[0], y + half[1])
-    yield from _background(
-        editor, plane, Aabb((*low, ground + 0.001), (*high, ground + max(height_m, 0.001)))
-    )
     for name, item in editor.objects.items():
         if item.absent:
             continue
@@ -171,17 +168,6 @@ def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[P
             part_box = part.aabb(IDENTITY)
             if pose.position_m[2] + part_box.high_m[2] > 0.001:
                 yield _footprint(f"{name}#{number}", pose, part_box)
-
-
-def _background(editor: SceneEditor, plane: Plane, around: Aabb) -> Iterator[PlaneFootprint]:
-    """Yield the background objects that reach into a box over the plane."""
-    inverse = plane.pose.inverse()
-    scene = editor.base
-    for number, (item, box) in enumerate(zip(scene.background, scene.background_boxes, strict=True)):
-        if box.overlaps(around) and (not item.host or item.host in editor.objects):
-            x, y, z = (extent / 2 for extent in box.size_m)
-            half = Aabb((-x, -y, -z), (x, y, z))
-            yield _footprint(f"background#{number}", inverse @ Pose(box.center_m), half)
 
 
 def _footprint(name: str, pose: Pose, box: Aabb) -> PlaneFootprint:

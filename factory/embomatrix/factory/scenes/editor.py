@@ -10,6 +10,8 @@ from enum import StrEnum
 from typing import Final
 
 from embomatrix.factory.assets.solids import Solids, placed_parts
+from embomatrix.factory.clutter.background import without_covered
+from embomatrix.factory.clutter.space import TakenSpace, needed_space
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
@@ -65,7 +67,8 @@ class SceneEditor:
         self._objects: dict[str, SceneObject] = {item.name: item for item in scene.objects}
         self._assets: dict[str, Asset] = dict(scene.assets)
         self._boxes: dict[str, Aabb] = {}
-        self._solids = Solids.of_scene(scene)
+        self._background = scene.background
+        self._solids = Solids.of_scene(replace(scene, background=()))
         self._kept: set[str] = set()
         self.floor = ReachableFloor(scene)
         """Floor that the robot can reach in the current scene."""
@@ -83,8 +86,8 @@ class SceneEditor:
 
     @property
     def background(self) -> tuple[BackgroundObject, ...]:
-        """Background objects of the base scene whose host is still there."""
-        return tuple(item for item in self.base.background if not item.host or item.host in self._objects)
+        """Background objects that have given way to no object and whose host is still there."""
+        return tuple(item for item in self._background if not item.host or item.host in self._objects)
 
     def known(self, name: str) -> SceneObject:
         """Return an object. Raise PlacementError for an unknown name."""
@@ -136,7 +139,7 @@ class SceneEditor:
         return None if self._keeps_paths_clear(asset, pose, box, room) else LayoutReason.BLOCKS_PATH
 
     def insert(self, asset: Asset, pose: Pose, relation: Relation | None, host: str, room: str = "") -> str:
-        """Add an object at a pose without checks, and return its name, ``category_N``.
+        """Add an object at a pose without checks, and return its name, ``category_N``. Background gives way.
 
         ``host`` supports it in ``relation``; empty means the floor. Without a room, the object's position decides.
         """
@@ -154,6 +157,7 @@ class SceneEditor:
         )
         self._assets[asset.asset_id] = asset
         self._solids.add(name, placed_parts(asset, pose))
+        self._clear_around(name)
         if box.low_m[2] < _ON_FLOOR_M:
             self.floor = ReachableFloor(self._as_scene())
         return name
@@ -179,9 +183,10 @@ class SceneEditor:
         return tuple(gone)
 
     def move(self, poses: Mapping[str, Pose]) -> None:
-        """Set the poses of objects. Raise PlacementError for an unknown name."""
+        """Set the poses of objects. Background gives way. Raise PlacementError for an unknown name."""
         for name, pose in poses.items():
             self._objects[name] = replace(self.known(name), pose_world_asset=pose)
+            self._clear_around(name)
         if poses:
             self._refresh(poses)
 
@@ -244,8 +249,14 @@ class SceneEditor:
         for name in changed:
             self._boxes.pop(name, None)
         scene = self._as_scene()
-        self._solids = Solids.of_scene(scene)
+        self._solids = Solids.of_scene(replace(scene, background=()))
         self.floor = ReachableFloor(scene)
+
+    def _clear_around(self, name: str) -> None:
+        """Remove the background where an object needs space, and what stands on removed background."""
+        item = self._objects[name]
+        needed = TakenSpace.of(needed_space(self._assets[item.asset_id], item))
+        self._background = without_covered(replace(self.base, background=self._background), needed)
 
     def _in_reach(self, box: Aabb, target: str) -> bool:
         if not ROBOT.reach_low_m <= box.center_m[2] <= ROBOT.reach_high_m:
