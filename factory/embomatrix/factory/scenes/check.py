@@ -219,7 +219,9 @@ def _background(scene: Scene) -> Iterator[SceneProblem]:
             host=item.host,
             relation=Relation.ONTOP,
         )
-        if item.host and not _rests(scene, standing, box):
+        if item.host and item.host not in scene.by_name:
+            yield SceneProblem(ProblemKind.NAME, names, f"its host {item.host!r} is not in the scene")
+        elif item.host and not _rests(scene, standing, box):
             yield SceneProblem(ProblemKind.FLOATING, names, "its underside rests on no surface of its host")
 
 
