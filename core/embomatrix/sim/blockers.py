@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.sim.engine import BACKGROUND, FLOOR, WALL
 from embomatrix.sim.floor.obstacles import WALLS
 from embomatrix.sim.geometry.surfaces import link_frame
 from embomatrix.skills.failure import FailureReason
@@ -26,7 +26,7 @@ SAME_M: Final = 1e-6
 RASTER_M: Final = 0.1
 """Spacing of the standing points that are tried."""
 A_WALL: Final = "a wall"
-_IN_WORDS: Final = {WALL: A_WALL, FLOOR: "the floor", "": "something"}
+_IN_WORDS: Final = {WALL: A_WALL, FLOOR: "the floor", BACKGROUND: "a background object", "": "something"}
 
 
 def arm_refusal(world: LiveWorld, handling: Handling, target: str) -> SkillRefusal | None:

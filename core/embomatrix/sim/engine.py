@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 WALL: Final = "wall"
 FLOOR: Final = "floor"
-"""Names that ``penetrates`` returns for walls and floor; no scene object has them."""
+BACKGROUND: Final = "background"
+"""Names that ``penetrates`` returns for walls, floor and background objects; no scene object has them."""
 TOLERANCE_M: Final = 0.001
 """Bodies that overlap by less than this touch; beyond it they penetrate."""
 SETTLE_STEPS: Final = 48
@@ -125,14 +126,14 @@ class PhysicsEngine(Protocol):
     def penetrates(self, name: str, margin_m: float = 0.0, ignore: frozenset[str] = NOTHING) -> str:
         """Name of one body that the object, grown by ``margin_m``, penetrates by more than 1 mm; "" for none.
 
-        ``FLOOR`` and ``WALL`` come first, then objects in scene order.
+        ``FLOOR``, ``WALL`` and ``BACKGROUND`` come first, then objects in scene order.
         """
 
     def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
         """Objects whose bounding boxes overlap the box, in scene order; parked ones are left out."""
 
-    def is_at_wall(self, box: Aabb) -> bool:
-        """Return True if the bounding box of a wall overlaps the box."""
+    def is_at_static(self, box: Aabb) -> bool:
+        """Return True if the bounding box of a wall or of a background object overlaps the box."""
 
     def gap(self, a: str, b: str, limit_m: float) -> float | None:
         """Smallest signed distance between two objects (negative: depth); None beyond ``limit_m``.

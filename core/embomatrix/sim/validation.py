@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from embomatrix.sim.engine import FLOOR, WALL, EngineError
+from embomatrix.sim.engine import BACKGROUND, FLOOR, WALL, EngineError
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.codec import asset_from_json, asset_to_json
 from embomatrix.world.geometry import Pose
@@ -14,7 +14,7 @@ from embomatrix.world.scene import Scene, SceneObject
 
 def check_scene(scene: Scene) -> None:
     """Raise EngineError for the first element of the scene that physics can't take."""
-    seen = {WALL, FLOOR}
+    seen = {WALL, FLOOR, BACKGROUND}
     for wall in scene.walls:
         check_asset(Asset("wall", "wall", "", wall.size_m, 1.0, (Link("base", (wall,)),)))
     for item in scene.objects:
@@ -28,7 +28,16 @@ def check_scene(scene: Scene) -> None:
             )
         check_pose(item.pose_world_asset, item.name)
         check_fractions(item, scene.assets[item.asset_id], item.joints)
-    for asset_id in sorted({item.asset_id for item in scene.objects}):
+    for thing in scene.background:
+        if thing.asset_id not in scene.assets:
+            raise EngineError(
+                f"a background object has the unknown asset {thing.asset_id!r}: expected one of the scene's "
+                f"{len(scene.assets)} assets; add it to the scene"
+            )
+        check_pose(thing.pose_world_asset, thing.asset_id)
+    for asset_id in sorted(
+        {*(item.asset_id for item in scene.objects), *(thing.asset_id for thing in scene.background)}
+    ):
         check_asset(scene.assets[asset_id])
 
 

@@ -12,6 +12,7 @@ from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.records import (
     MAX_LINKS,
     AssetJson,
+    BackgroundJson,
     LinkJson,
     ObjectJson,
     PartJson,
@@ -20,7 +21,7 @@ from embomatrix.world.records import (
     SceneJson,
     convert,
 )
-from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
+from embomatrix.world.scene import BackgroundObject, Doorway, RobotStart, Room, Scene, SceneObject, Window
 from embomatrix.world.state import Relation, SubstanceFact
 from embomatrix.world.tables import FLAT_HULL, Tables, TableWriter, check_unit, has_volume
 
@@ -31,7 +32,7 @@ R = TypeVar("R")
 
 MAX_FLOOR_M2: Final = 40_000.0
 """Area of the rectangle around all rooms: the navigation grid covers it with cells of 5 cm."""
-RESERVED_NAMES: Final = frozenset(("wall", "floor"))
+RESERVED_NAMES: Final = frozenset(("wall", "floor", "background"))
 """Names of the engine for bodies that are not objects."""
 _RELATIONS: Final = {"": None, **{relation.value: relation for relation in Relation}}
 
@@ -52,6 +53,8 @@ def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
     }
     if scene.windows:
         value["windows"] = _builtins(scene.windows)
+    if scene.background:
+        value["background"] = [_background_to_json(item, tables) for item in scene.background]
     return value
 
 
@@ -112,6 +115,9 @@ def scene_of(record: SceneJson, tables: Tables | None = None) -> Scene:
         robot=RobotStart(*msgspec.structs.astuple(record.robot)),
         left_out=record.left_out,
         windows=_same(Window, record.windows),
+        background=_each(
+            "scene.background", record.background, lambda item: _background(item, assets, tables, texts)
+        ),
     )
     _check_references(scene)
     return scene
@@ -170,6 +176,15 @@ def _object_to_json(item: SceneObject, tables: TableWriter | None) -> Json:
     if item.pieces:
         value["pieces"] = [*item.pieces]
     return value
+
+
+def _background_to_json(item: BackgroundObject, tables: TableWriter | None) -> Json:
+    value: Json = {
+        "asset_id": item.asset_id,
+        "room": item.room,
+        "pose": pose_to_json(item.pose_world_asset, tables),
+    }
+    return value | {"host": item.host} if item.host else value
 
 
 def _same(kind: Callable[..., T], records: Iterable[msgspec.Struct]) -> tuple[T, ...]:
@@ -255,11 +270,7 @@ def _object(
     record: ObjectJson, assets: Mapping[str, Asset], tables: Tables | None, texts: dict[str, str]
 ) -> SceneObject:
     """Object of one of the assets. ``texts`` keeps one copy of equal texts: a fork then copies fewer pages of memory."""
-    asset = assets.get(record.asset_id)
-    if asset is None:
-        raise SceneInvalidError(
-            "asset_id", f"found {record.asset_id[:80]!r}: expected one of the scene's {len(assets)} assets"
-        )
+    asset = _known_asset(record.asset_id, assets)
     if len(record.joints) != len(asset.joints):
         raise SceneInvalidError(
             "joints",
@@ -283,6 +294,27 @@ def _object(
         record.absent,
         record.pieces,
     )
+
+
+def _background(
+    record: BackgroundJson, assets: Mapping[str, Asset], tables: Tables | None, texts: dict[str, str]
+) -> BackgroundObject:
+    """Background object of one of the assets; ``texts`` as in ``_object``."""
+    return BackgroundObject(
+        _known_asset(record.asset_id, assets).asset_id,
+        texts.setdefault(record.room, record.room),
+        _pose(record.pose, tables),
+        texts.setdefault(record.host, record.host),
+    )
+
+
+def _known_asset(asset_id: str, assets: Mapping[str, Asset]) -> Asset:
+    asset = assets.get(asset_id)
+    if asset is None:
+        raise SceneInvalidError(
+            "asset_id", f"found {asset_id[:80]!r}: expected one of the scene's {len(assets)} assets"
+        )
+    return asset
 
 
 def _check_known(path: str, names: Iterable[str], known: set[str], kind: str) -> None:
@@ -324,6 +356,9 @@ def _check_references(scene: Scene) -> None:
         _check_known(f"{path}.host", (item.host,), known_names, "host")
         if item.pieces:
             _check_known(f"{path}.pieces", item.pieces, absent, "absent object")
+    for index, thing in enumerate(scene.background):
+        _check_known(f"scene.background[{index}].room", (thing.room,), known_rooms, "room")
+        _check_known(f"scene.background[{index}].host", (thing.host,), known_names, "host")
     for index, doorway in enumerate(scene.doorways):
         _check_known(f"scene.doorways[{index}].rooms", doorway.rooms, known_rooms, "room")
     for index, window in enumerate(scene.windows):

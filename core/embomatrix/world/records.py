@@ -211,6 +211,13 @@ class ObjectJson(Record):
     pieces: tuple[str, ...] = ()
 
 
+class BackgroundJson(Record):
+    asset_id: str
+    room: str
+    pose: PoseNumbers | int
+    host: str = ""
+
+
 class SceneJson(Record):
     scene_id: Name
     base: str
@@ -223,6 +230,7 @@ class SceneJson(Record):
     robot: RobotJson
     left_out: tuple[str, ...]
     windows: list[WindowJson] = []
+    background: Annotated[list[BackgroundJson], Meta(max_length=MAX_OBJECTS)] = []
 
 
 class TaskJson(Record):

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from embomatrix.world.asset import Asset
-from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Vec2, Vec3
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape, Vec2, Vec3
 from embomatrix.world.state import Relation, State, SubstanceFact
 
 
@@ -92,6 +92,20 @@ class SceneObject:
 
 
 @dataclass(frozen=True, slots=True)
+class BackgroundObject:
+    """Object that makes a room lived-in: books on a shelf, a towel on the wall. Seen and collided with, never moved or named.
+
+    It collides as the bounding box of its asset. ``host`` is the fixed object that it stands on or in; empty on walls and on
+    other background objects.
+    """
+
+    asset_id: str
+    room: str
+    pose_world_asset: Pose
+    host: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class RobotStart:
     """Base of the robot on the floor at the start: world x, y and heading."""
 
@@ -120,6 +134,29 @@ class Scene:
     left_out: tuple[str, ...] = field(default=())
     """Inventory items without a place, one sentence each: nothing is dropped silently."""
     windows: tuple[Window, ...] = field(default=())
+    background: tuple[BackgroundObject, ...] = field(default=())
+    """Objects without a name: tasks, plans and relations never refer to them."""
+
+    @cached_property
+    def background_parts(self) -> tuple[ConvexPart, ...]:
+        """Bounding box of each background object in the world frame: its shape in a collision."""
+        return tuple(
+            ConvexPart(Shape.BOX, item.pose_world_asset, self.assets[item.asset_id].size_m)
+            for item in self.background
+        )
+
+    @cached_property
+    def background_boxes(self) -> tuple[Aabb, ...]:
+        """World box of each background object."""
+        if not self.background:
+            return ()
+        poses = [item.pose_world_asset for item in self.background]
+        turns = {quat: np.abs(Pose((0.0, 0.0, 0.0), quat).rotation) for quat in {p.quat_xyzw for p in poses}}
+        halves = np.array([self.assets[item.asset_id].size_m for item in self.background]) / 2  # (n, 3)
+        reach = np.einsum("nij,nj->ni", np.array([turns[p.quat_xyzw] for p in poses]), halves)  # (n, 3)
+        centers = np.array([p.position_m for p in poses])  # (n, 3)
+        rows = np.concatenate([centers - reach, centers + reach], axis=1).tolist()
+        return tuple(Aabb((a, b, c), (d, e, f)) for a, b, c, d, e, f in rows)
 
     @cached_property
     def by_name(self) -> Mapping[str, SceneObject]:

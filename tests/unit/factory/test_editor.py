@@ -66,7 +66,7 @@ def test_base_scene_is_unchanged_and_used_assets_are_included(flat: Scene) -> No
     assert flat.objects == before
     assert scene.scene_id == "task-scene"
     assert scene.base == flat.base
-    assert set(scene.assets) == {item.asset_id for item in scene.objects}
+    assert set(scene.assets) == {item.asset_id for item in (*scene.objects, *scene.background)}
     assert scene.by_name[name].asset_id in scene.assets
 
 

@@ -15,7 +15,7 @@ import pytest
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.engine import FLOOR, WALL, EngineError
+from embomatrix.sim.engine import BACKGROUND, FLOOR, WALL, EngineError
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.codec import RESERVED_NAMES, scene_from_json, scene_to_json
@@ -232,7 +232,7 @@ def test_unmodified_flat_is_valid():
     scene = kitchen_scene()
     assert decode_bundle(encode_bundle(Bundle(scene, {}))).scene == scene
     assert decode_bundle(encode_bundle(Bundle(hull(CUBE), {}))).scene == hull(CUBE)
-    assert {WALL, FLOOR} == RESERVED_NAMES
+    assert {WALL, FLOOR, BACKGROUND} == RESERVED_NAMES
 
 
 def test_scene_file_with_400_000_objects_is_refused_quickly():

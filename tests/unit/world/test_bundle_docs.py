@@ -32,6 +32,7 @@ KINDS = {
     "window": records.WindowJson,
     "robot": records.RobotJson,
     "object": records.ObjectJson,
+    "background object": records.BackgroundJson,
     "asset": records.AssetJson,
     "link": records.LinkJson,
     "joint": records.JointJson,

@@ -102,8 +102,8 @@ class BodyFactory:
         masses = [panels_kg[owner] / owners.count(owner) if owner else 0.0 for owner in owners]
         return self._create(masses, pieces, pose)
 
-    def walls(self, parts: Sequence[ConvexPart]) -> tuple[int, ...]:
-        """Immovable bodies that hold 16 walls each; wall ``i`` is in body ``i // 16``."""
+    def statics(self, parts: Sequence[ConvexPart]) -> tuple[int, ...]:
+        """Immovable bodies that hold 16 parts each; part ``i`` is in body ``i // 16``."""
         chunks = [parts[i : i + PART_LIMIT] for i in range(0, len(parts), PART_LIMIT)]
         made = [self._link_pieces(chunk, (0.0, 0.0, 0.0), None, 0) for chunk in chunks]
         return tuple(self._create([0.0] * len(pieces), pieces, IDENTITY) for pieces in made)

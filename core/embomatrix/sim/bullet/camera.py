@@ -62,6 +62,7 @@ def furnish_cutaway(stage: VisualScene) -> None:
     stage.add_floors()
     stage.add_walls(lambda wall: _cut(stage.scene, wall))
     stage.add_objects(lambda item: not _hangs_at_ceiling(stage.scene, item))
+    stage.add_background()
 
 
 def furnish_whole(stage: VisualScene) -> None:
@@ -69,6 +70,7 @@ def furnish_whole(stage: VisualScene) -> None:
     stage.add_floors()
     stage.add_walls(lambda wall: wall)
     stage.add_objects()
+    stage.add_background()
 
 
 def shoot_oblique(

@@ -6,7 +6,7 @@ from typing import Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import BulletClient
-from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.sim.engine import BACKGROUND, FLOOR, WALL
 from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import Pose, Vec3
 from embomatrix.world.scene import Scene
@@ -53,13 +53,14 @@ class DynamicBodies:
     def fill(self, poses: Mapping[str, Pose], joints: Mapping[str, tuple[float, ...]]) -> None:
         """Fill an empty client.
 
-        Floor, walls, and objects at these poses and joint positions; objects without a pose stay outside.
+        Floor, walls, background, and objects at these poses and joint positions; objects without a pose stay outside.
         """
         self._factory.forget_shapes()
         floor = self._factory.floor(0.0, 0.0, FLOOR_HALF_M)
-        walls = self._factory.walls(self._scene.walls)
-        self._names = {floor: FLOOR} | dict.fromkeys(walls, WALL)
-        self._still = [floor, *walls]
+        walls = self._factory.statics(self._scene.walls)
+        background = self._factory.statics(self._scene.background_parts)
+        self._names = {floor: FLOOR} | dict.fromkeys(walls, WALL) | dict.fromkeys(background, BACKGROUND)
+        self._still = [floor, *walls, *background]
         for number, item in enumerate(self._scene.objects):
             pose = poses.get(item.name, Pose((number * 3.0, 0.0, AWAY_M)))
             self._add(item.name, pose, joints[item.name])

@@ -11,11 +11,11 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bullet.bodies import PART_LIMIT
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.mini_world import MiniWorld, StaticObject
 from embomatrix.sim.bullet.scene_bodies import SceneBodies
 from embomatrix.sim.engine import (
+    BACKGROUND,
     FLOOR,
     NOTHING,
     SETTLE_STEPS,
@@ -74,9 +74,8 @@ class BulletEngine:
         for number, box in enumerate(self._boxes):
             if self._present[number]:
                 self._around.put(number, box)
-        self._walls_around = _spatial_hash(
-            prepared.wall_boxes if prepared else [wall.aabb(IDENTITY) for wall in scene.walls]
-        )
+        walls = prepared.wall_boxes if prepared else [wall.aabb(IDENTITY) for wall in scene.walls]
+        self._statics_around = _spatial_hash((*walls, *scene.background_boxes))
         self._journal = Journal()
         self._changed: set[int] = set()
         self._chunks: dict[int, bytes] = {}
@@ -184,10 +183,14 @@ class BulletEngine:
         if FLOOR not in ignore and box.low_m[2] < limit:
             return FLOOR
         reach = max(limit, 0.0) + BOX_SLACK_M
-        if WALL not in ignore and (walls := self._walls_around.near(box, reach)):
-            for body in sorted({wall // PART_LIMIT for wall in walls}):
-                if self._closest(self._body(number), self._bodies.wall(body), limit) < limit:
-                    return WALL
+        if statics := self._statics_around.near(box, reach):
+            for first in sorted({self._bodies.first_of(static) for static in statics}):
+                kind = WALL if first < len(self._scene.walls) else BACKGROUND
+                if (
+                    kind not in ignore
+                    and self._closest(self._body(number), self._bodies.static(first), limit) < limit
+                ):
+                    return kind
         names = self._names
         for other in self._around.near(box, reach):
             if other == number or names[other] in ignore:
@@ -202,8 +205,8 @@ class BulletEngine:
             names[number] for number in self._around.near(box) if not ignore or names[number] not in ignore
         )
 
-    def is_at_wall(self, box: Aabb) -> bool:
-        return bool(self._walls_around.near(box))
+    def is_at_static(self, box: Aabb) -> bool:
+        return bool(self._statics_around.near(box))
 
     def gap(self, a: str, b: str, limit_m: float) -> float | None:
         first, second = self._number(a), self._number(b)
@@ -225,10 +228,11 @@ class BulletEngine:
             for other in self._around.near(box, SETTLE_RADIUS_M)
             if other != number and self._names[other] not in ignore
         ]
-        walls = [self._scene.walls[wall] for wall in self._walls_around.near(box, SETTLE_RADIUS_M)]
+        statics = self._bodies.statics
+        parts = [statics[static] for static in self._statics_around.near(box, SETTLE_RADIUS_M)]
         pose = self._poses[number]
         region = box.grown(SETTLE_RADIUS_M)
-        self._mini.stage(self._assets[number], pose, self._fractions[number], stills, walls, region)
+        self._mini.stage(self._assets[number], pose, self._fractions[number], stills, parts, region)
         return self._mini.drop(pose, steps)
 
     def state_bytes(self) -> bytes:
@@ -249,12 +253,12 @@ class BulletEngine:
         return struct.pack(f"<i?{len(values)}d", number, present, *values)
 
     def warm_up(self) -> Iterator[None]:
-        """Make missing bodies of objects and walls, one per step. Changes no answer."""
+        """Make missing bodies of objects, walls and background, one per step. Changes no answer."""
         for number in self._bodies.missing():
             self._body(number)
             yield
-        for chunk in range(math.ceil(len(self._scene.walls) / PART_LIMIT)):
-            self._bodies.wall(chunk)
+        for first in sorted({self._bodies.first_of(static) for static in range(len(self._bodies.statics))}):
+            self._bodies.static(first)
             yield
 
     def close(self) -> None:

@@ -71,10 +71,10 @@ class MiniWorld:
         pose: Pose,
         fractions: Sequence[float],
         stills: Sequence[StaticObject],
-        walls: Sequence[ConvexPart] = (),
+        parts: Sequence[ConvexPart] = (),
         region: Aabb | None = None,
     ) -> None:
-        """Build a world of one moving object, static ones, walls and the floor.
+        """Build a world of one moving object, static ones, static parts such as walls, and the floor.
 
         With a ``region``, only static parts that reach into it are built.
         """
@@ -83,11 +83,11 @@ class MiniWorld:
         slab = ConvexPart(
             Shape.BOX, Pose((x, y, -FLOOR_THICKNESS_M / 2)), (FLOOR_M, FLOOR_M, FLOOR_THICKNESS_M)
         )
-        parts = [slab, *walls]
+        still = [slab, *parts]
         for item in stills:
             box = region if region is not None else EVERYWHERE
-            parts += bounds_of(item.asset).parts_within(item.pose, item.fractions, box)
-        self._still = self._factory.walls(parts)
+            still += bounds_of(item.asset).parts_within(item.pose, item.fractions, box)
+        self._still = self._factory.statics(still)
         self._body = self._factory.rigid(asset, pose, fractions, asset.mass_kg)
         if any(part.shape in ROUND for link in asset.links for part in link.parts):
             self._factory.brake(self._body)

@@ -1,4 +1,4 @@
-"""Bodies of a scene's objects and walls in one client, each made on demand.
+"""Bodies of a scene's objects, walls and background in one client, each made on demand.
 
 Making a body costs fifteen times as much as a distance query, and a rollout queries a tenth of its scene. Results do not
 depend on which bodies exist: they are never stepped, only compared in pairs.
@@ -14,7 +14,10 @@ from embomatrix.world.scene import Scene
 
 
 class SceneBodies:
-    """Immovable bodies by the numbers of a scene's objects and walls. The client must be empty."""
+    """Immovable bodies by the numbers of a scene's objects and static parts. The client must be empty.
+
+    Static parts are the walls, then the background objects. Sixteen neighbours share a body.
+    """
 
     def __init__(self, client: BulletClient, scene: Scene) -> None:
         self._bullet = client
@@ -22,7 +25,9 @@ class SceneBodies:
         self._factory = BodyFactory(client)
         self._objects: dict[int, int] = {}
         self._behind: set[int] = set()
-        self._walls: dict[int, int] = {}
+        self.statics = (*scene.walls, *scene.background_parts)
+        self._shared: dict[int, int] = {}
+        """Bodies of static parts by the number of their first part."""
 
     def object(self, number: int, pose: Pose, fractions: Sequence[float]) -> int:
         """Body of an object at the pose, with its joints at these shares of their travel."""
@@ -46,12 +51,19 @@ class SceneBodies:
         """Numbers of the objects without a body."""
         return (number for number in range(len(self._scene.objects)) if number not in self._objects)
 
-    def wall(self, chunk: int) -> int:
-        """Body of walls number ``16 * chunk`` up to ``16 * (chunk + 1)``, exclusive."""
-        if chunk not in self._walls:
-            parts = self._scene.walls[chunk * PART_LIMIT : (chunk + 1) * PART_LIMIT]
-            [self._walls[chunk]] = self._factory.walls(parts)
-        return self._walls[chunk]
+    def first_of(self, static: int) -> int:
+        """Number of the first part in the body of a static part. Walls and background share no body."""
+        walls = len(self._scene.walls)
+        return static - (static if static < walls else static - walls) % PART_LIMIT
+
+    def static(self, first: int) -> int:
+        """Body of static parts, given by the number of its first part."""
+        if first not in self._shared:
+            walls = len(self._scene.walls)
+            end = first + PART_LIMIT
+            parts = self.statics[first : min(end, walls) if first < walls else end]
+            [self._shared[first]] = self._factory.statics(parts)
+        return self._shared[first]
 
     def _put(self, body: int, pose: Pose) -> None:
         self._bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw)

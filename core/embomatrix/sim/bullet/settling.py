@@ -10,7 +10,7 @@ import numpy as np
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import BulletClient, connect
 from embomatrix.sim.bullet.mini_world import CHUNK_STEPS, GRAVITY_M_S2, SLOW_M_S, SLOW_RAD_S, settled_from
-from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL, Settled
+from embomatrix.sim.engine import BACKGROUND, FLOOR, TOLERANCE_M, WALL, Settled
 from embomatrix.sim.validation import check_scene
 from embomatrix.world.geometry import Pose
 from embomatrix.world.scene import Scene
@@ -58,7 +58,8 @@ class _Fall:
         high = np.max([room.high_m for room in scene.rooms], axis=0)
         x, y = (low + high) / 2
         floor = factory.floor(float(x), float(y), float(max(high - low)) / 2 + MARGIN_M)
-        self._names = {floor: FLOOR, **dict.fromkeys(factory.walls(scene.walls), WALL)}
+        self._names = {floor: FLOOR, **dict.fromkeys(factory.statics(scene.walls), WALL)}
+        self._names |= dict.fromkeys(factory.statics(scene.background_parts), BACKGROUND)
         self._starts: dict[int, Pose] = {}
         for item in scene.objects:
             if item.absent:

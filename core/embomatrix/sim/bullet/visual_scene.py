@@ -101,6 +101,16 @@ class VisualScene:
             if not item.absent:
                 self.put(item.name, item.pose_world_asset, item.joints)
 
+    def add_background(self) -> None:
+        """Add the background objects at their places."""
+        for item in self.scene.background:
+            asset = self.scene.assets[item.asset_id]
+            # Books of one category stand side by side: each model has its own colour.
+            color = _hue(zlib.crc32(item.asset_id.encode()) / 2**32) if is_small(asset) else color_of(asset)
+            for link in asset.links:
+                for part in link.parts:
+                    self._add_part(part, item.pose_world_asset, color)
+
     def put(self, name: str, pose: Pose, fractions: Sequence[float] = ()) -> None:
         """Show an object at a pose in the world, its joints at shares of their travel; unknown solids stay unseen."""
         solids = iter(self._solids.get(name, ()))
@@ -212,7 +222,7 @@ def _material(wall: ConvexPart) -> Rgba:
 
 def color_of(asset: Asset) -> Rgba:
     """Colour by function; small objects get a vivid colour from their category."""
-    if max(asset.size_m) < 0.6 and asset.mass_kg <= ROBOT.mass_kg:
+    if is_small(asset):
         return _hue(zlib.crc32(asset.category.encode()) / 2**32)
     if asset.category in _CLOTH:
         return _SOFT
@@ -221,6 +231,11 @@ def color_of(asset: Asset) -> Rgba:
     if asset.can("openable"):
         return _OPENS
     return _WORKS if asset.can("toggleable") or asset.can("heatSource") else _RESTS
+
+
+def is_small(asset: Asset) -> bool:
+    """Return True for a small object, which gets a vivid colour."""
+    return max(asset.size_m) < 0.6 and asset.mass_kg <= ROBOT.mass_kg
 
 
 def _hue(share: float) -> Rgba:

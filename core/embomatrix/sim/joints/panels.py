@@ -123,14 +123,14 @@ class DoorPanels:
         return frozenset(self._engine.near(swept.grown(PANEL_SLACK_M), frozenset((self._name,))))
 
     def _near_panels(self, fractions: Sequence[float]) -> frozenset[str]:
-        """Objects, walls and floor near any panel at these joint positions."""
+        """Objects, walls with background objects, and floor near any panel at these joint positions."""
         engine, near = self._engine, set[str]()
         for panel in bounds_of(self._asset).panel_boxes(self._base, fractions):
             box = panel.grown(PANEL_SLACK_M)
             near.update(engine.near(box))
             if panel.low_m[2] < 0.0:
                 near.add(FLOOR)
-            if engine.is_at_wall(box):
+            if engine.is_at_static(box):
                 near.add(WALL)
         return frozenset(near - {self._name})
 

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from embomatrix.sim.engine import FLOOR, WALL, PhysicsEngine
+from embomatrix.sim.engine import BACKGROUND, FLOOR, WALL, PhysicsEngine
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, Aabb, FloatArray, Pose, Shape
@@ -128,7 +128,7 @@ class BallCollision:
 
 
 def boxes_around(engine: PhysicsEngine, low: tuple[float, float], high: tuple[float, float]) -> Boxes:
-    """Return the parts of all objects and walls over a rectangle of the floor, with doors in their present position."""
+    """Return the parts of objects, walls and background over a rectangle of the floor, with doors where they are now."""
     scene = engine.scene
     window = Aabb((low[0], low[1], -1.0), (high[0], high[1], 3.0))
     rows: list[tuple[Pose, tuple[float, float, float], str]] = []
@@ -140,6 +140,9 @@ def boxes_around(engine: PhysicsEngine, low: tuple[float, float], high: tuple[fl
     for wall in scene.walls:
         if wall.aabb(IDENTITY).overlaps(window):
             rows.append((wall.pose, wall.size_m, WALL))
+    for part, box in zip(scene.background_parts, scene.background_boxes, strict=True):
+        if box.overlaps(window):
+            rows.append((part.pose, part.size_m, BACKGROUND))
     rows.append((Pose((0.0, 0.0, -0.5)), (1e3, 1e3, 1.0), FLOOR))
     return boxes_of(rows).near(np.array(window.low_m), np.array(window.high_m))
 

@@ -184,8 +184,12 @@ class _Surveyor:
             (other, self._contents.of(scene.asset_of(other)), engine.pose(other), engine.joints(other))
             for other in (name, *engine.near(window, frozenset((name,))))
         ]
-        walls = [(wall.pose, wall.size_m) for wall in scene.walls if wall.aabb(IDENTITY).overlaps(window)]
-        return hashlib.sha256(repr((handling, rows, walls, stands)).encode()).digest()
+        statics = [
+            (part.pose, part.size_m)
+            for part in (*scene.walls, *scene.background_parts)
+            if part.aabb(IDENTITY).overlaps(window)
+        ]
+        return hashlib.sha256(repr((handling, rows, statics, stands)).encode()).digest()
 
     def _blocker(self, name: str, handling: Handling) -> str:
         """Return the blocker of a handling from the present standing pose; "" for none."""

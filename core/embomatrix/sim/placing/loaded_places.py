@@ -47,8 +47,8 @@ def loaded_places(
         around = valid.around().grown(NOTHING_NEAR_M)
         others = [engine.aabb(name) for name in engine.near(around, frozenset((target,)))]
         lonely = ~boxes.meet(others, NOTHING_NEAR_M)
-        if engine.is_at_wall(around):
-            lonely &= [not engine.is_at_wall(box.grown(NOTHING_NEAR_M)) for box in boxes.each()]
+        if engine.is_at_static(around):
+            lonely &= [not engine.is_at_static(box.grown(NOTHING_NEAR_M)) for box in boxes.each()]
     table = np.column_stack([boxes.lows_m, boxes.highs_m, lonely])
     return LoadedPlaces(table, {} if any(engine.joints(target)) else None)
 

@@ -52,7 +52,8 @@ class Placer:
     def warm_up(self) -> Iterator[None]:
         """Compute footprints, contact polygons and part boxes, one asset per step. Changes no answer."""
         movable = {item.asset_id for item in self._scene.objects if not item.fixed}
-        for asset_id, asset in self._scene.assets.items():
+        for asset_id in dict.fromkeys(item.asset_id for item in self._scene.objects):
+            asset = self._scene.assets[asset_id]
             if asset_id in movable:
                 self.options.footprints[asset_id]
                 self.options.bases[asset_id]

@@ -23,6 +23,7 @@ from embomatrix.world.scene import Scene
 TOLERANCE_M: Final = 0.001
 """Shallower overlaps are contact, not penetration."""
 WALL: Final = "wall"
+BACKGROUND: Final = "background"
 _SIDES: Final = 32
 
 
@@ -100,8 +101,9 @@ class Solids:
 
     @staticmethod
     def of_scene(scene: Scene) -> Solids:
-        """Return the walls and all objects of a scene with their joints shut."""
+        """Return walls, background and all objects of a scene with their joints shut."""
         solids = Solids()
+        solids.add(BACKGROUND, [convex_of(part, IDENTITY) for part in scene.background_parts])
         solids.add(WALL, [convex_of(wall, IDENTITY) for wall in scene.walls])
         for item in scene.objects:
             solids.add(item.name, placed_parts(scene.assets[item.asset_id], item.pose_world_asset))

@@ -17,6 +17,7 @@ from embomatrix.factory.commands.options import Seed
 from embomatrix.factory.commands.terminal import check_output, counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
+from embomatrix.factory.evaluate.density import density_figures, homes
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.lies import evaluate_lies
 from embomatrix.factory.evaluate.page import with_factory
@@ -183,14 +184,15 @@ async def _judged(judge: Judge, groups: Mapping[str, Sequence[DraftFeatures]], s
 def _scenes(
     tasks: Sequence[SourceText], only: int, seed: int, jobs: int, outcomes: Path | None
 ) -> EvaluationFigures:
-    """Measure generation rate, verification pass rate and time, by layout tree and two baselines."""
+    """Measure generation rate, verification pass rate and time by three methods, and the density of base scenes."""
     kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
     with user_errors(outcomes, kept):
         log = outcome_log(outcomes, seed)
         with counter("trials", len(tasks) * len(METHODS)) as count:
             evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log)
     taken = {"taken": f"one in {only} of the fixed tasks"} if only > 1 else {}
-    return replace(evaluation, conditions={**taken, **evaluation.conditions})
+    figures = (*evaluation.figures, *density_figures(homes()[::only], seed))
+    return replace(evaluation, figures=figures, conditions={**taken, **evaluation.conditions})
 
 
 async def _looks(judge: Judge, tasks: Sequence[SourceText], seed: int) -> EvaluationFigures:

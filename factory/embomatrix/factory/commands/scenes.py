@@ -72,6 +72,9 @@ Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and objects left out.")
 ]
 Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets that replace generated ones.")]
+Background = Annotated[
+    bool, typer.Option(help="Fill homes with background objects, as many as real rooms hold.")
+]
 CORES = usable_cores()
 _user_errors = partial(user_errors, more=(FloorPlanError, ModelFileError, SceneFileError))
 LEFT_OUT = "for objects that were left out, and why: `embomatrix scene show NAME`, or --report FILE"
@@ -94,6 +97,7 @@ def build(
     report: Report = None,
     jobs: Jobs = CORES,
     assets: Assets = None,
+    background: Background = True,
 ) -> None:
     """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 if one has a problem."""
     chosen = _chosen(scene_ids, every)
@@ -108,7 +112,13 @@ def build(
         out.mkdir(parents=True, exist_ok=True)
     several = len(set(seeds or ())) > 1
     orders = [
-        SceneBuildJob(name, seed, out / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
+        SceneBuildJob(
+            name,
+            seed,
+            out / (f"{name}-{seed}.json" if several else f"{name}.json"),
+            assets,
+            background=background,
+        )
         for name in chosen
         for seed in dict.fromkeys(seeds or (0,))
     ]
@@ -147,7 +157,9 @@ def show(scene: SceneSource, seed: Seed = 0) -> None:
         doors = [d for d in built.doorways if room.name in d.rooms]
         beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
         windows = sum(room.name in window.rooms for window in built.windows)
-        counts = Counter(built.assets[o.asset_id].category for o in built.objects if o.room == room.name)
+        mine = [item.asset_id for item in built.objects if item.room == room.name]
+        mine += [item.asset_id for item in built.background if item.room == room.name]
+        counts = Counter(built.assets[asset_id].category for asset_id in mine)
         listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
         size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
         rows.append((room.name, size, ", ".join(beyond), windows, listed))

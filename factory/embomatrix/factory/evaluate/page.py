@@ -81,7 +81,8 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "`embomatrix factory evaluate scenes` lays out the same tasks with three methods and checks each scene with code that "
         "no method uses. *aesthetics* covers the tasks that a method laid out, *aesthetics_shared* the tasks that all methods "
         "laid out. Simple methods fail in crowded rooms, which score low. The score is of whole rooms, most of which no "
-        "method changes.",
+        "method changes. *objects_per_living_room* and its like are medians over the rooms of all homes among the base scenes; "
+        "background objects count.",
     ),
 }
 """Heading and explanation of each part, in the order of the page."""

@@ -38,6 +38,7 @@ FILL: Final = {
     "hung": "#c9b8e0",
     "rug": "#e4d3d3",
     "plant": "#bcd9a9",
+    "background": "#c9c4ba",
 }
 _LEGEND: Final = (
     ("opens", "opens (cabinet, fridge, oven ...)"),
@@ -46,6 +47,7 @@ _LEGEND: Final = (
     ("hung", "on the wall, above the robot"),
     ("rug", "rug"),
     ("plant", "plant"),
+    ("background", "background object without a name"),
 )
 _SIGNS: Final = (
     "triangle: front · red: doorway · blue: window",
@@ -61,6 +63,7 @@ def draw_plan(scene: Scene) -> Image.Image:
     plan = _Plan(scene)
     plan.building()
     plan.furniture()
+    plan.background()
     plan.small_things()
     plan.robot()
     lines = plan.label()
@@ -161,6 +164,11 @@ class _Plan:
             x, y = self._px(*item.pose_world_asset.position_m[:2])
             self._draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=_dot_color(item))
             self._marks.append((x - 3, y - 3, x + 3, y + 3))
+
+    def background(self) -> None:
+        """Draw the footprints of background objects."""
+        for box in self._scene.background_boxes:
+            self._draw.rectangle(self._box(box.low_m, box.high_m), fill=FILL["background"], outline="#8d877c")
 
     def robot(self) -> None:
         start = self._scene.robot

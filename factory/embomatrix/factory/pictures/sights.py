@@ -35,6 +35,7 @@ def alone(scene: Scene, name: str) -> Scene:
         doorways=tuple(door for door in scene.doorways if name in door.rooms),
         windows=tuple(window for window in scene.windows if name in window.rooms),
         objects=tuple(item for item in scene.objects if item.room == name),
+        background=tuple(item for item in scene.background if item.room == name),
     )
 
 

@@ -24,6 +24,8 @@ class SceneBuildJob:
     path: Path | None = None
     assets: Path | None = None
     source: Path | None = None
+    background: bool = True
+    """Fill homes with background objects."""
 
 
 def run_batch(jobs: Sequence[SceneBuildJob], *, processes: int) -> Iterator[SceneReport]:
@@ -52,7 +54,7 @@ def _run(job: SceneBuildJob) -> SceneReport:
     if job.source is not None:
         return report_on_file(job.scene_id, job.seed, job.source)
     imported = read_assets(job.assets) if job.assets is not None else {}
-    report, scene = report_on(job.scene_id, job.seed, imported)
+    report, scene = report_on(job.scene_id, job.seed, imported, background=job.background)
     if scene is not None and job.path is not None:
         try:
             write_scene(job.path, scene)

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.clutter.background import with_background
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
 from embomatrix.factory.floorplan.spec import OpeningSpec, RoomSpec
 from embomatrix.factory.furnish.pieces import FurniturePiece, Placed
@@ -38,11 +39,16 @@ _FLAT_ON_WALL: Final = frozenset(_FLAT_NAMES.split())
 
 
 def build_base_scene(
-    scene_id: str, *, seed: int = 0, imported: Mapping[str, Asset] = MappingProxyType({})
+    scene_id: str,
+    *,
+    seed: int = 0,
+    imported: Mapping[str, Asset] = MappingProxyType({}),
+    background: bool = True,
 ) -> Scene:
     """Lay out and furnish one of the catalog's inventories. Equal arguments give equal scenes.
 
-    ``imported`` assets replace generated ones with the same id. Raises CatalogError for an unknown scene, FloorPlanError if
+    ``imported`` assets replace generated ones with the same id. Without ``background``, a home holds only the objects that
+    its inventory lists. Raises CatalogError for an unknown scene, FloorPlanError if
     its rooms can't be joined.
     """
     catalog = Catalog.load()
@@ -66,11 +72,13 @@ def build_base_scene(
         windows=plan.windows,
     )
     scene = with_all_served(scene)
+    scene = with_background(scene) if background else scene
     logger.info(
-        "scene built id=%s seed=%d objects=%d left_out=%d",
+        "scene built id=%s seed=%d objects=%d background=%d left_out=%d",
         scene_id,
         seed,
         len(scene.objects),
+        len(scene.background),
         len(scene.left_out),
     )
     return scene

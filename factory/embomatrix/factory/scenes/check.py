@@ -6,11 +6,11 @@ Most rules are checked by geometry. The engine tests penetration a second time a
 import contextlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
-from embomatrix.factory.assets.solids import Solids, placed_parts
+from embomatrix.factory.assets.solids import Solids, convex_of, placed_parts
 from embomatrix.factory.floorplan.spec import MIN_DOOR_M
 from embomatrix.factory.furnish.pieces import Access
 from embomatrix.factory.scenes.access import unserved
@@ -19,7 +19,7 @@ from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.settling import settle_scene
 from embomatrix.sim.engine import FLOOR
-from embomatrix.world.geometry import Aabb
+from embomatrix.world.geometry import IDENTITY, Aabb
 from embomatrix.world.scene import Scene, SceneObject
 from embomatrix.world.state import Relation
 
@@ -67,6 +67,7 @@ def check_scene(scene: Scene) -> tuple[SceneProblem, ...]:
         *_penetrations(scene),
         *_supports(scene),
         *_rooms(scene),
+        *_background(scene),
         *reach_problems(scene),
         *_openings(scene),
     )
@@ -192,6 +193,36 @@ def _rooms(scene: Scene) -> Iterator[SceneProblem]:
             yield SceneProblem(
                 ProblemKind.ROOM, (item.name,), f"its middle lies outside its room {item.room!r}"
             )
+
+
+def _background(scene: Scene) -> Iterator[SceneProblem]:
+    """Yield background objects that overlap anything, stand on nothing, or lie outside their room."""
+    solids = Solids.of_scene(replace(scene, background=()))
+    rooms = {room.name: room for room in scene.rooms}
+    places = zip(scene.background, scene.background_parts, scene.background_boxes, strict=True)
+    for item, part, box in places:
+        names = (f"background {item.asset_id}", item.host)
+        convex = [convex_of(part, IDENTITY)]
+        for other, depth in solids.overlaps(convex).items():
+            detail = f"a background {item.asset_id} and {other} overlap by {depth * 1000:.1f} mm"
+            yield SceneProblem(ProblemKind.PENETRATION, (names[0], other), detail)
+        solids.add(names[0], convex)
+        x, y, _ = item.pose_world_asset.position_m
+        if item.room not in rooms or not rooms[item.room].contains(x, y):
+            yield SceneProblem(ProblemKind.ROOM, names[:1], f"its middle lies outside its room {item.room!r}")
+        standing = SceneObject(
+            names[0],
+            item.asset_id,
+            item.room,
+            item.pose_world_asset,
+            fixed=True,
+            host=item.host,
+            relation=Relation.ONTOP,
+        )
+        if item.host and item.host not in scene.by_name:
+            yield SceneProblem(ProblemKind.NAME, names, f"its host {item.host!r} is not in the scene")
+        elif item.host and not _rests(scene, standing, box):
+            yield SceneProblem(ProblemKind.FLOATING, names, "its underside rests on no surface of its host")
 
 
 def reach_problems(scene: Scene) -> Iterator[SceneProblem]:

@@ -10,6 +10,8 @@ from enum import StrEnum
 from typing import Final
 
 from embomatrix.factory.assets.solids import Solids, placed_parts
+from embomatrix.factory.clutter.background import without_covered
+from embomatrix.factory.clutter.space import TakenSpace, needed_space
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
@@ -19,7 +21,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
 from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, Pose, Shape
-from embomatrix.world.scene import Room, Scene, SceneObject
+from embomatrix.world.scene import BackgroundObject, Room, Scene, SceneObject
 from embomatrix.world.state import Relation, State
 
 _ON_FLOOR_M: Final = 0.05
@@ -65,7 +67,8 @@ class SceneEditor:
         self._objects: dict[str, SceneObject] = {item.name: item for item in scene.objects}
         self._assets: dict[str, Asset] = dict(scene.assets)
         self._boxes: dict[str, Aabb] = {}
-        self._solids = Solids.of_scene(scene)
+        self._background = scene.background
+        self._solids = Solids.of_scene(replace(scene, background=()))
         self._kept: set[str] = set()
         self.floor = ReachableFloor(scene)
         """Floor that the robot can reach in the current scene."""
@@ -80,6 +83,11 @@ class SceneEditor:
     def objects(self) -> Mapping[str, SceneObject]:
         """Current objects by name, in scene order."""
         return self._objects
+
+    @property
+    def background(self) -> tuple[BackgroundObject, ...]:
+        """Background objects that have given way to no object and whose host is still there."""
+        return tuple(item for item in self._background if not item.host or item.host in self._objects)
 
     def known(self, name: str) -> SceneObject:
         """Return an object. Raise PlacementError for an unknown name."""
@@ -131,7 +139,7 @@ class SceneEditor:
         return None if self._keeps_paths_clear(asset, pose, box, room) else LayoutReason.BLOCKS_PATH
 
     def insert(self, asset: Asset, pose: Pose, relation: Relation | None, host: str, room: str = "") -> str:
-        """Add an object at a pose without checks, and return its name, ``category_N``.
+        """Add an object at a pose without checks, and return its name, ``category_N``. Background gives way.
 
         ``host`` supports it in ``relation``; empty means the floor. Without a room, the object's position decides.
         """
@@ -149,6 +157,7 @@ class SceneEditor:
         )
         self._assets[asset.asset_id] = asset
         self._solids.add(name, placed_parts(asset, pose))
+        self._clear_around(name)
         if box.low_m[2] < _ON_FLOOR_M:
             self.floor = ReachableFloor(self._as_scene())
         return name
@@ -174,9 +183,10 @@ class SceneEditor:
         return tuple(gone)
 
     def move(self, poses: Mapping[str, Pose]) -> None:
-        """Set the poses of objects. Raise PlacementError for an unknown name."""
+        """Set the poses of objects. Background gives way. Raise PlacementError for an unknown name."""
         for name, pose in poses.items():
             self._objects[name] = replace(self.known(name), pose_world_asset=pose)
+            self._clear_around(name)
         if poses:
             self._refresh(poses)
 
@@ -218,23 +228,35 @@ class SceneEditor:
 
     def freeze(self, scene_id: str) -> Scene:
         """Return the current scene with the assets that it uses."""
-        objects = tuple(self._objects.values())
-        used = {item.asset_id: self._assets[item.asset_id] for item in objects}
-        return replace(self.base, scene_id=scene_id, objects=objects, assets=used)
+        scene = self._as_scene()
+        used = {item.asset_id for item in scene.objects} | {item.asset_id for item in scene.background}
+        assets = {key: asset for key, asset in self._assets.items() if key in used}
+        return replace(scene, scene_id=scene_id, assets=assets)
 
     def _new_name(self, asset: Asset) -> str:
         self._counts[asset.category] += 1
         return f"{asset.category}_{self._counts[asset.category]}"
 
     def _as_scene(self) -> Scene:
-        return replace(self.base, objects=tuple(self._objects.values()), assets=self._assets)
+        return replace(
+            self.base,
+            objects=tuple(self._objects.values()),
+            background=self.background,
+            assets=self._assets,
+        )
 
     def _refresh(self, changed: Mapping[str, object]) -> None:
         for name in changed:
             self._boxes.pop(name, None)
         scene = self._as_scene()
-        self._solids = Solids.of_scene(scene)
+        self._solids = Solids.of_scene(replace(scene, background=()))
         self.floor = ReachableFloor(scene)
+
+    def _clear_around(self, name: str) -> None:
+        """Remove the background where an object needs space, and what stands on removed background."""
+        item = self._objects[name]
+        needed = TakenSpace.of(needed_space(self._assets[item.asset_id], item))
+        self._background = without_covered(replace(self.base, background=self._background), needed)
 
     def _in_reach(self, box: Aabb, target: str) -> bool:
         if not ROBOT.reach_low_m <= box.center_m[2] <= ROBOT.reach_high_m:
@@ -250,7 +272,7 @@ class SceneEditor:
             return False
         item = SceneObject("candidate", asset.asset_id, room, pose, fixed=False)
         assets = {**self._assets, asset.asset_id: asset}
-        trial = replace(self.base, objects=(*self._objects.values(), item), assets=assets)
+        trial = replace(self.base, objects=(*self._objects.values(), item), background=(), assets=assets)
         known = self._unreached | {(name,) for name in self.given_up}
         return {problem.names for problem in reach_problems(trial)} <= known
 

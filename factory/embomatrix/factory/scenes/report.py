@@ -73,12 +73,16 @@ class SceneReport:
 
 
 def report_on(
-    scene_id: str, seed: int, imported: Mapping[str, Asset] = MappingProxyType({})
+    scene_id: str,
+    seed: int,
+    imported: Mapping[str, Asset] = MappingProxyType({}),
+    *,
+    background: bool = True,
 ) -> tuple[SceneReport, Scene | None]:
     """Build one scene, perhaps with imported assets, and check it; the report contains failures."""
     started = time.process_time()
     try:
-        scene = build_base_scene(scene_id, seed=seed, imported=imported)
+        scene = build_base_scene(scene_id, seed=seed, imported=imported, background=background)
     except (CatalogError, FloorPlanError) as error:
         return SceneReport(scene_id, seed, error=str(error)), None
     built = time.process_time()
