@@ -19,14 +19,14 @@ _TOUCH_M: Final = 1e-3
 
 
 class Clearance:
-    """Test of a scene's objects against the clear zones. Objects that rest on furniture are ignored."""
+    """Test of a scene's objects against the clear zones. Objects that rest on furniture are ignored, except on a rug."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._rooms = {room.name: room for room in scene.rooms}
         rows, names = [], []
         for item in scene.objects:
-            if item.host:
+            if item.host and scene.box_of(item.host).high_m[2] > LOW_M:
                 continue
             for link in scene.assets[item.asset_id].links:
                 for part in link.parts:
