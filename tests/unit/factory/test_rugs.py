@@ -7,6 +7,7 @@ import pytest
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.evaluate.furnishing import furnishing_counts
+from embomatrix.factory.evaluate.room_plans import kind_of, plan_of
 from embomatrix.factory.furnish.pieces import REST_GAP_M, FurniturePiece, Placed
 from embomatrix.factory.furnish.roles import role_of
 from embomatrix.factory.furnish.rugs import lay_rugs
@@ -88,3 +89,13 @@ def test_scene_with_rugs_has_all_of_them_under_furniture_and_breaks_no_rule(scen
     found, judged = furnishing_counts(scene).carpets_under
     assert found == judged > 0
     assert check_scene(scene) == ()
+
+
+def test_furniture_on_a_rug_still_counts_as_furniture_on_the_floor() -> None:
+    scene = build_base_scene("house_double_floor_upper")
+    lifted = [item for item in scene.objects if item.host.startswith("carpet_")]
+    assert lifted
+    plan = plan_of(scene, lifted[0].room)
+    kinds = {kind_of(scene.asset_of(item.name).category) for item in lifted}
+    assert kinds <= {piece.kind for piece in plan.pieces}
+    assert not kinds & {thing.kind for thing in plan.things}

@@ -43,7 +43,7 @@ _LIFTED: Final = frozenset(("sofa", "bed", "armchair", "nightstand", "eames_chai
 """Furniture that may stand on a rug, besides that of the roles above."""
 _UNDER: Final = 0.3
 """Least share of a rug's area under the furniture."""
-_LEAST: Final = 0.05
+_LEAST: Final = 0.02
 """Least share even if the furniture stands on the rug: a small table on a large rug."""
 _HALF_UNDER: Final = 0.5
 _SOLID: Final = frozenset(("sofa", "bed", "armchair"))

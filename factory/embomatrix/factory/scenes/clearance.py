@@ -26,7 +26,7 @@ class Clearance:
         self._rooms = {room.name: room for room in scene.rooms}
         rows, names = [], []
         for item in scene.objects:
-            if item.host and scene.box_of(item.host).high_m[2] > LOW_M:
+            if item.host and not _lies_flat(scene, item.host):
                 continue
             for link in scene.assets[item.asset_id].links:
                 for part in link.parts:
@@ -90,6 +90,11 @@ class Clearance:
     def _within(self, zone: FloatArray) -> tuple[str, ...]:
         hits = np.flatnonzero(_overlap(self._boxes, zone))
         return tuple(dict.fromkeys(self._names[hit] for hit in hits))
+
+
+def _lies_flat(scene: Scene, name: str) -> bool:
+    """True for a rug, which counts as floor."""
+    return name in scene.by_name and scene.box_of(name).high_m[2] <= LOW_M
 
 
 def _overlap(boxes: FloatArray, zone: FloatArray) -> BoolArray:
