@@ -2,7 +2,8 @@
 
 A category is a kind of solid object; substances (water, salt, diced apple) are synsets with the ability "substance". The
 tables in ``data/`` (see their NOTICE) are derived from the ``bddl`` package. The only run-time changes are the corrections in
-this module. Sizes are metres (depth x, width y, height z), masses kilograms, temperatures degrees Celsius.
+this module and in `appliance_rules`. Sizes are metres (depth x, width y, height z), masses kilograms, temperatures degrees
+Celsius.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from dataclasses import dataclass, replace
 from importlib import resources
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.world.appliance_rules import corrected
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Vec2, Vec3
@@ -181,13 +184,13 @@ class Catalog:
 
     @functools.cache  # noqa: B019 - the one instance lives as long as the process
     def category(self, name: str) -> Category:
-        """Synset, mass and abilities of a category. Raises CatalogError."""
+        """Synset, mass and abilities of a category after `SOURCE_RULES`. Raises CatalogError."""
         entry = _look_up(self._categories, name, "category")
         return Category(
             name=name,
             synset=entry["synset"],
             mass_kg=entry["mass_kg"],
-            abilities=self.abilities_of(entry["synset"]),
+            abilities=corrected(name, self.abilities_of(entry["synset"])),
         )
 
     @functools.cache  # noqa: B019

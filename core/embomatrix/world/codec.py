@@ -21,7 +21,16 @@ from embomatrix.world.records import (
     SceneJson,
     convert,
 )
-from embomatrix.world.scene import BackgroundObject, Doorway, RobotStart, Room, Scene, SceneObject, Window
+from embomatrix.world.scene import (
+    ROOM_HEIGHT_M,
+    BackgroundObject,
+    Doorway,
+    RobotStart,
+    Room,
+    Scene,
+    SceneObject,
+    Window,
+)
 from embomatrix.world.state import Relation, SubstanceFact
 from embomatrix.world.tables import FLAT_HULL, Tables, TableWriter, check_unit, has_volume
 
@@ -43,7 +52,7 @@ def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
         "scene_id": scene.scene_id,
         "base": scene.base,
         "seed": scene.seed,
-        "rooms": _builtins(scene.rooms),
+        "rooms": [_room_to_json(room) for room in scene.rooms],
         "walls": [_part_to_json(part, tables) for part in scene.walls],
         "doorways": _builtins(scene.doorways),
         "objects": [_object_to_json(item, tables) for item in scene.objects],
@@ -55,6 +64,13 @@ def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
         value["windows"] = _builtins(scene.windows)
     if scene.background:
         value["background"] = [_background_to_json(item, tables) for item in scene.background]
+    return value
+
+
+def _room_to_json(room: Room) -> Json:
+    value: Json = _builtins(room)
+    if room.height_m == ROOM_HEIGHT_M:
+        del value["height_m"]
     return value
 
 

@@ -19,6 +19,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import Shape
 from embomatrix.world.poses import Handling
+from embomatrix.world.scene import ROOM_HEIGHT_M
 from embomatrix.world.state import Relation, State, SubstanceRelation
 from embomatrix.world.task import MAX_NAME, MAX_TABLE, Profile, TaskCategory
 
@@ -32,6 +33,7 @@ MAX_PARTS: Final = 16
 MAX_LINKS: Final = 100
 MAX_MASS_KG: Final = 1e6
 MAX_ROOMS: Final = 1_000
+MAX_CEILING_M: Final = 100.0
 MAX_WALLS: Final = 10_000
 MAX_OBJECTS: Final = 5_000
 MAX_TEXT: Final = 10_000
@@ -78,6 +80,7 @@ class RoomJson(Record):
     type: Name
     low_m: tuple[Number, Number]
     high_m: tuple[Number, Number]
+    height_m: Annotated[float, Meta(gt=0.0, le=MAX_CEILING_M)] = ROOM_HEIGHT_M
 
     def __post_init__(self) -> None:
         if not (self.low_m[0] < self.high_m[0] and self.low_m[1] < self.high_m[1]):

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
@@ -10,15 +11,22 @@ from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape, Vec2, Vec3
 from embomatrix.world.state import Relation, State, SubstanceFact
 
+ROOM_HEIGHT_M: Final = 2.4
+"""Height of a room whose record gives none."""
+
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """Axis-aligned rectangle of floor. ``low_m`` and ``high_m`` are its corners in the world's xy plane."""
+    """Axis-aligned rectangle of floor. ``low_m`` and ``high_m`` are its corners in the world's xy plane.
+
+    ``height_m`` is the height of its ceiling above the floor; nothing stands for the ceiling itself.
+    """
 
     name: str
     type: str
     low_m: Vec2
     high_m: Vec2
+    height_m: float = ROOM_HEIGHT_M
 
     @property
     def size_m(self) -> Vec2:

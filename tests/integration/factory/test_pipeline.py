@@ -41,7 +41,7 @@ from embomatrix.world.intent import IntentClause
 from embomatrix.world.scene import Room, Scene
 from embomatrix.world.task import Task, TaskCategory
 
-TASKS_DIGEST = "d69bf6465a116ada798c3d1f19ed777f6bcdc33673436f0b2543856bed42fe41"
+TASKS_DIGEST = "be790361f87b9ff61007f6447ee2c97016e836c45cb8e2ed354c613e45301322"
 """SHA-256 of the task records of `SETTINGS` without the digests of their bundles."""
 QUICK = {"look_ahead": False, "physical": False}
 SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"), **QUICK)

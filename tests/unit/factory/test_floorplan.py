@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from embomatrix.factory.floorplan.layout import FloorPlan, compactness, plan_floor
 from embomatrix.factory.floorplan.spec import MIN_DOOR_M, FloorPlanError, OpeningSpec, RoomSpec
-from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M, WALL_M
+from embomatrix.factory.floorplan.walls import WALL_M
 from embomatrix.factory.scenes.build import room_spec
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import ROOM_HEIGHT_M
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 ORIGIN = Pose((0.0, 0.0, 0.0))
@@ -74,7 +75,7 @@ def test_walls_stand_on_no_floor_and_leave_inner_doorways_open(scene_id: str) ->
     for door in plan.doorways:
         blocked = any(box.contains((*door.center_m, 1.0)) for box in boxes)
         assert blocked == (door.rooms[1] == "")
-        assert any(box.contains((*door.center_m, WALL_HEIGHT_M - 0.05)) for box in boxes)
+        assert any(box.contains((*door.center_m, ROOM_HEIGHT_M - 0.05)) for box in boxes)
 
 
 @pytest.fixture(scope="module")

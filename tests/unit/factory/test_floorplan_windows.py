@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
 from embomatrix.factory.floorplan.spec import OpeningSpec, RoomSpec
-from embomatrix.factory.floorplan.walls import PANE_M, WALL_HEIGHT_M
+from embomatrix.factory.floorplan.walls import PANE_M
 from embomatrix.factory.floorplan.windows import GAP_M, HEAD_M, LEAST_SILL_M, sill_and_head
 from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.scene import ROOM_HEIGHT_M
 
 if TYPE_CHECKING:
     from embomatrix.world.scene import Window
@@ -61,7 +62,7 @@ def test_sill_and_head_follow_the_window_height(height: float, sill: float, head
 @given(st.floats(0.05, 20.0))
 def test_every_window_fits_the_wall(height: float) -> None:
     sill, head = sill_and_head(height)
-    assert LEAST_SILL_M <= sill < head <= HEAD_M < WALL_HEIGHT_M
+    assert LEAST_SILL_M <= sill < head <= HEAD_M < ROOM_HEIGHT_M
     assert head - sill <= height + 1e-9
 
 

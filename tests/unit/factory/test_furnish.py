@@ -80,7 +80,7 @@ def test_worktop_lies_on_its_tallest_cabinet() -> None:
         block("bottom_cabinet", (0.5, 0.5, 0.55), door=True),
         block("bottom_cabinet", (0.5, 0.45, 0.53), door=True),
     )
-    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03)), cabinet, lower))
+    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03)), cabinet, lower), ROOM)
     (counter,) = groups
     assert isinstance(counter, FurnitureGroup)
     slab = counter.members[-1]
@@ -93,7 +93,7 @@ def test_worktop_lies_on_its_tallest_cabinet() -> None:
 @pytest.mark.parametrize("depth_m", [0.6, 0.7, 0.9, 1.2])
 def test_worktop_overhangs_the_drawers_below_it_only_a_little(depth_m) -> None:
     cabinet = block("bottom_cabinet", (0.5, 0.9, 0.55), door=True)
-    (counter,), _ = room_groups(pieces(block("countertop", (depth_m, 1.0, 0.03)), cabinet))
+    (counter,), _ = room_groups(pieces(block("countertop", (depth_m, 1.0, 0.03)), cabinet), ROOM)
     under, slab = counter.members
     front = under.x + under.piece.size_m[0] / 2
     assert -1e-9 <= slab.x + slab.piece.size_m[0] / 2 - front <= 0.15 + 1e-9
@@ -101,7 +101,7 @@ def test_worktop_overhangs_the_drawers_below_it_only_a_little(depth_m) -> None:
 
 
 def test_worktop_without_cabinets_is_left_out_with_a_reason() -> None:
-    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))), "kitchen")
+    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))), ROOM)
     assert groups == []
     assert [(piece.category, reason) for piece, reason in left_out] == [
         ("countertop", "no base cabinets are left to carry it")

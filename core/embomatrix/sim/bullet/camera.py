@@ -1,5 +1,6 @@
 """Pictures of a scene by Bullet's software renderer: oblique from above, and from the robot's camera."""
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Final
@@ -19,6 +20,8 @@ CUT_M: Final = 0.45
 """Walls between the camera and the rooms are shown up to this height."""
 CEILING_M: Final = 2.3
 """Objects that hang this high are left out: they would hide the rooms."""
+_SHOWN_M: Final = 3.6
+"""Walls of higher rooms are shown up to this height in oblique pictures."""
 ELEVATION: Final = math.radians(52.0)
 AZIMUTH: Final = math.radians(-60.0)
 """The camera looks from the south-south-east."""
@@ -77,8 +80,8 @@ def shoot_oblique(
     stage: VisualScene, rooms: tuple[Room, ...], width_px: int, height_px: int
 ) -> NDArray[np.uint8]:
     """Render these rooms obliquely, filling the picture."""
-    low = np.min([room.low_m for room in rooms], axis=0)
-    high = np.max([room.high_m for room in rooms], axis=0)
+    low = np.min([(*room.low_m, 0.0) for room in rooms], axis=0)
+    high = np.max([(*room.high_m, min(room.height_m, _SHOWN_M)) for room in rooms], axis=0)
     aspect = width_px / height_px
     target, distance = _framing(low, high, aspect)
     view = stage.look_at((target + _direction() * distance).tolist(), target.tolist())
@@ -104,18 +107,18 @@ def _start(scene: Scene) -> StandPose:
 
 def _hangs_at_ceiling(scene: Scene, item: SceneObject) -> bool:
     height = scene.assets[item.asset_id].size_m[2]
-    return item.pose_world_asset.position_m[2] + height / 2 > CEILING_M and height < 1.8
+    middle = item.pose_world_asset.position_m[2]
+    return middle + height / 2 > CEILING_M and (height < 1.8 or middle > CEILING_M)
 
 
 def _cut(scene: Scene, wall: ConvexPart) -> ConvexPart | None:
-    """Cut walls that hide a room from the camera; leave the others whole."""
-    if not _hides(scene, wall):
-        return wall
+    """Cut walls that hide a room from the camera low, the others at the height that is shown."""
+    upper_m = CUT_M if _hides(scene, wall) else _SHOWN_M
     low_m = wall.aabb(IDENTITY).low_m[2]
-    if low_m >= CUT_M:
+    if low_m >= upper_m:
         return None
     x, y, _ = wall.pose.position_m
-    high_m = min(CUT_M, wall.aabb(IDENTITY).high_m[2])
+    high_m = min(upper_m, wall.aabb(IDENTITY).high_m[2])
     size = (wall.size_m[0], wall.size_m[1], high_m - low_m)
     return replace(wall, size_m=size, pose=Pose((x, y, (low_m + high_m) / 2), wall.pose.quat_xyzw))
 
@@ -146,7 +149,7 @@ def _framing(low: FloatArray, high: FloatArray, aspect: float) -> tuple[FloatArr
     right = np.cross([0.0, 0.0, 1.0], look)
     right /= np.linalg.norm(right)
     up = np.cross(look, right)
-    corners = np.array([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0.0, 2.4)])
+    corners = np.array([*itertools.product(*zip(low, high, strict=True))])  # (8, 3)
     tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))
     target = corners.mean(axis=0)
     distance = 1.0

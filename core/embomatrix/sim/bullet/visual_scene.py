@@ -42,10 +42,13 @@ _RESTS: Final[Rgba] = (0.60, 0.47, 0.38, 1.0)
 _SOFT: Final[Rgba] = (0.45, 0.50, 0.62, 1.0)
 _DOOR: Final[Rgba] = (0.55, 0.30, 0.18, 1.0)
 _GLASS: Final[Rgba] = (0.66, 0.84, 0.93, 1.0)
+_MIRROR: Final[Rgba] = (0.90, 0.96, 0.99, 1.0)
+_FRAME: Final[Rgba] = (0.30, 0.27, 0.25, 1.0)
 _LEAVES: Final[Rgba] = (0.42, 0.58, 0.36, 1.0)
 _PLANTS: Final = frozenset(
     {"tree", "low_resolution_tree", "bush", "pot_plant", "hanging_plant", "greenery", "vine"}
 )
+_MIRRORS: Final = frozenset({"mirror", "standing_mirror"})
 _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
 _PANEL_M: Final = 0.1
 _PANE_M: Final = 0.03
@@ -91,11 +94,10 @@ class VisualScene:
             if not visible(item):
                 continue
             asset = self.scene.assets[item.asset_id]
-            color = color_of(asset)
-            # Panels and drawers stand out from the body that they close.
+            colors = iter(part_colors(asset))
             self._solids[item.name] = [
-                (self._add_part(part, OUT_OF_SIGHT, color if number == 0 else _lighter(color)), part)
-                for number, link in enumerate(asset.links)
+                (self._add_part(part, OUT_OF_SIGHT, next(colors)), part)
+                for link in asset.links
                 for part in link.parts
             ]
             if not item.absent:
@@ -220,7 +222,21 @@ def _material(wall: ConvexPart) -> Rgba:
     return _DOOR if thickness < _PANEL_M else _WALL
 
 
-def color_of(asset: Asset) -> Rgba:
+def part_colors(asset: Asset) -> list[Rgba]:
+    """Colours of the parts of all links: panels and drawers stand out from the body that they close, glass from its frame."""
+    if asset.category in _MIRRORS:
+        parts = [part for link in asset.links for part in link.parts]
+        glass = max(parts, key=lambda part: part.size_m[1] * part.size_m[2])
+        return [_MIRROR if part is glass else _FRAME for part in parts]
+    color = _color_of(asset)
+    return [
+        color if number == 0 else _lighter(color)
+        for number, link in enumerate(asset.links)
+        for _ in link.parts
+    ]
+
+
+def _color_of(asset: Asset) -> Rgba:
     """Colour by function; small objects get a vivid colour from their category."""
     if is_small(asset):
         return _hue(zlib.crc32(asset.category.encode()) / 2**32)

@@ -5,7 +5,16 @@ from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import Self
 
-from embomatrix.factory.assets import cabinets, fixtures, furniture, goods, shapes, structures, vessels
+from embomatrix.factory.assets import (
+    cabinets,
+    corners,
+    fixtures,
+    furniture,
+    goods,
+    shapes,
+    structures,
+    vessels,
+)
 from embomatrix.factory.assets.body import Body, Proportions, proportioned
 from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
 
@@ -68,6 +77,10 @@ class Family(StrEnum):
     SWIVEL_CHAIR = "swivel_chair", furniture.swivel_chair
     STOOL = "stool", furniture.stool
     SOFA = "sofa", furniture.sofa
+    CORNER_SOFA = "corner_sofa", corners.corner_sofa
+    CORNER_BENCH = "corner_bench", corners.corner_bench
+    CORNER_BAR = "corner_bar", corners.corner_bar
+    CORNER_WORKTOP = "corner_worktop", corners.corner_worktop
     BED = "bed", furniture.bed
     BUNK_BED = "bunk_bed", furniture.bunk_bed
     LAMP = "lamp", furniture.lamp
@@ -103,6 +116,7 @@ class Family(StrEnum):
     WINDOW = "window", fixtures.window
     LAPTOP = "laptop", fixtures.laptop
     SCREEN = "screen", fixtures.screen
+    MIRROR = "mirror", fixtures.mirror
     PLANT = "plant", fixtures.plant
     TREE = "tree", fixtures.tree
     CAR = "car", fixtures.car
@@ -123,6 +137,7 @@ class Family(StrEnum):
     RUNGS = "rungs", structures.rungs
     STALL = "stall", structures.stall
     STAIRCASE = "staircase", structures.staircase
+    TIERS = "tiers", structures.tiers
     LADDER = "ladder", structures.ladder
     TREADMILL = "treadmill", structures.treadmill
     LORRY = "lorry", structures.lorry

@@ -230,6 +230,15 @@ def screen(size_m: Vec3) -> Body:
     )
 
 
+def mirror(size_m: Vec3) -> Body:
+    """A pane of glass in a frame on the wall."""
+    outer = centred(size_m)
+    frame = clamp(0.05 * min(size_m[1:]), 0.015, 0.05)
+    boards, gap = shell(outer, Walls(0.0, 0.0, frame, frame, frame, frame))
+    pane = spanning(gap, 0, (gap.low_m[0], gap.low_m[0] + 0.6 * size_m[0]))
+    return Body([box_of(pane), *boards])
+
+
 def plant(size_m: Vec3) -> Body:
     """A pot with a crown of leaves."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m

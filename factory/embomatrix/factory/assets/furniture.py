@@ -76,7 +76,7 @@ def block(size_m: Vec3) -> Body:
     return Body([box_of(centred(size_m))])
 
 
-def _seat_height(height_m: float) -> float:
+def seat_height(height_m: float) -> float:
     """Return the height of a seat: 0.42 m, bounded by shares of the whole height for low and high models."""
     return clamp(0.42, 0.35 * height_m, 0.62 * height_m)
 
@@ -84,7 +84,7 @@ def _seat_height(height_m: float) -> float:
 def chair(size_m: Vec3) -> Body:
     """Seat on four legs with a back."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    z = z0 + _seat_height(size_m[2])
+    z = z0 + seat_height(size_m[2])
     leg, seat, back = clamp(0.08 * min(size_m[:2]), 0.008, 0.045), 0.04, clamp(0.1 * size_m[0], 0.01, 0.05)
     parts = [
         box((x0, y0, z - seat), (x1, y1, z)),
@@ -97,7 +97,7 @@ def chair(size_m: Vec3) -> Body:
 def swivel_chair(size_m: Vec3) -> Body:
     """Seat and back on a column with a cross of feet."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    z, seat, foot = z0 + _seat_height(size_m[2]), 0.06, 0.06
+    z, seat, foot = z0 + seat_height(size_m[2]), 0.06, 0.06
     back, arm = 0.12 * size_m[0], 0.05
     parts = [
         box((x0, y0, z - seat), (x1, y1, z)),
@@ -114,16 +114,10 @@ def stool(size_m: Vec3) -> Body:
     return table(size_m, "seat")
 
 
-CORNER_FROM_M: Final = 1.4
-"""A sofa larger than this along both sides is a corner sofa: no seat is as deep."""
-
-
 def sofa(size_m: Vec3) -> Body:
-    """Upholstered base on short feet with back and arms; a deep and wide model is a corner sofa."""
-    if size_m[0] > CORNER_FROM_M and size_m[1] > CORNER_FROM_M:
-        return _corner_sofa(size_m)
+    """Upholstered base on short feet with back and arms."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
+    z, feet = z0 + seat_height(size_m[2]), 0.1 * size_m[2]
     back = clamp(0.22 * size_m[0], 0.05, 0.3)
     arm = clamp(0.12 * size_m[1], 0.05, 0.2)
     rest = z + 0.4 * (z1 - z)
@@ -135,24 +129,6 @@ def sofa(size_m: Vec3) -> Body:
         *legs((x0, y0), (x1, y1), (z0, z0 + feet), clamp(0.08 * min(size_m[:2]), 0.02, 0.08)),
     ]
     return Body(parts).add_support("seat", (x0 + back, y0 + arm), (x1, y1 - arm), z)
-
-
-def _corner_sofa(size_m: Vec3) -> Body:
-    """Seats along the back and along the right side with a back rest behind each; open floor between them."""
-    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
-    deep, back = 0.95, 0.22
-    parts = [
-        box((x0, y0, z0 + feet), (x0 + deep, y1, z)),
-        box((x0 + deep, y0, z0 + feet), (x1, y0 + deep, z)),
-        box((x0, y0, z), (x0 + back, y1, z1)),
-        box((x0 + back, y0, z), (x1, y0 + back, z1)),
-        *legs((x0, y0), (x0 + deep, y1), (z0, z0 + feet), 0.08),
-        box((x1 - 0.08, y0, z0), (x1, y0 + 0.08, z0 + feet)),
-        box((x1 - 0.08, y0 + deep - 0.08, z0), (x1, y0 + deep, z0 + feet)),
-    ]
-    body = Body(parts).add_support("seat", (x0 + back, y0 + back), (x0 + deep, y1), z)
-    return body.add_support("long_seat", (x0 + deep, y0 + back), (x1, y0 + deep), z)
 
 
 def bed(size_m: Vec3) -> Body:

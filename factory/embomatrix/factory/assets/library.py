@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from embomatrix.factory.assets.cabinets import MAX_PARTS
+from embomatrix.factory.assets.corners import is_corner
 from embomatrix.factory.assets.families import Family
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.catalog import Catalog
@@ -76,8 +77,8 @@ _NAMES: Final[Mapping[Family, str]] = {
     Family.COUNTER: "bar reception_desk checkout_counter display_case chopping_block pedestal",
     Family.CHAIR: "straight_chair folding_chair garden_chair rocking_chair highchair bench eames_chair",
     Family.SWIVEL_CHAIR: "swivel_chair",
-    Family.STOOL: "taboret bar_stool music_stool footstool ottoman hammam_bench sauna_bench flat_bench "
-    "bench_press_machine stadium_stand pommel_horse",
+    Family.STOOL: "taboret bar_stool music_stool footstool ottoman flat_bench bench_press_machine pommel_horse",
+    Family.TIERS: "stadium_stand sauna_bench hammam_bench",
     Family.SOFA: "sofa armchair infant_car_seat",
     Family.BED: "bed hospital_bed chaise_longue",
     Family.BUNK_BED: "bunk_bed",
@@ -140,6 +141,7 @@ _NAMES: Final[Mapping[Family, str]] = {
     Family.WINDOW: "openable_window",
     Family.LAPTOP: "laptop",
     Family.SCREEN: "standing_tv monitor standing_mirror",
+    Family.MIRROR: "mirror",
     Family.PLANT: "pot_plant pottable_cactus pottable_chili pottable_daffodil pottable_dahlia pottable_marigold "
     "pottable_beefsteak_tomato flower bouquet garden_plant",
     Family.TREE: "tree low_resolution_tree christmas_tree christmas_tree_decorated",
@@ -267,17 +269,26 @@ _CABINETS: Final = (
     Family.CUPBOARD, Family.DRAWER_CUPBOARD, Family.CUPBOARD, Family.CHEST_OF_DRAWERS,
 )  # fmt: skip
 """Families shared out among low cabinets: the catalog does not say whether a model has doors or drawers."""
+_CORNERS: Final[Mapping[str, Family]] = {
+    "sofa": Family.CORNER_SOFA,
+    "bench": Family.CORNER_BENCH,
+    "bar": Family.CORNER_BAR,
+    "countertop": Family.CORNER_WORKTOP,
+}
+"""Family of models that stand round a corner."""
 _LOW_CABINETS: Final = frozenset({"bottom_cabinet", "bottom_cabinet_no_top", "metal_bottom_cabinet"})
 _LOW_M: Final = 1.1
 
 
 def family_of_model(catalog: Catalog, category: str, model_id: str) -> Family:
-    """Return the family of one model: that of its category, or the variant with drawers.
+    """Return the family of one model: that of its category, the variant with drawers, or that round a corner.
 
     Raises CatalogError for an unknown category or model.
     """
     family = family_of(catalog, category)
     model = catalog.model(category, model_id)
+    if is_corner(category, model.size_m):
+        return _CORNERS[category]
     if "joint" not in model.meta_links:
         return family
     if category in _LOW_CABINETS and model.size_m[2] <= _LOW_M:

@@ -20,6 +20,8 @@ COUNTER_M: Final = 0.9
 """Height of a stall's counter."""
 RUNG_M: Final = 0.12
 """Distance between the rungs of a rack: an object laid across rests on several of them."""
+TIER_M: Final = 0.45
+"""Height of a row of seats above the row before it."""
 MOST_RUNGS: Final = 10
 """Upper limit for a rack's rungs: a link has at most 16 parts."""
 
@@ -131,6 +133,19 @@ def staircase(size_m: Vec3) -> Body:
         for number in range(steps)
     ]
     return Body(parts).add_support("step1", (x1 - tread, y0), (x1, y1), z0 + rise)
+
+
+def tiers(size_m: Vec3) -> Body:
+    """Benches that rise towards the back, each with a seat: stands of a gym, benches of a sauna."""
+    (x0, y0, z0), (x1, y1, _) = centred(size_m).low_m, centred(size_m).high_m
+    rows = int(clamp(round(size_m[2] / TIER_M), 1, 12))
+    tread, rise = size_m[0] / rows, size_m[2] / rows
+    body = Body([])
+    for number in range(rows):
+        front, top = x1 - number * tread, z0 + (number + 1) * rise
+        body.parts.append(box((x0, y0, top - rise), (front, y1, top)))
+        body.add_support(f"tier{number + 1}", (front - tread, y0), (front, y1), top)
+    return body
 
 
 def ladder(size_m: Vec3) -> Body:

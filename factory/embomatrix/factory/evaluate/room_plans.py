@@ -104,7 +104,8 @@ def plan_of(scene: Scene, room_name: str) -> RoomPlan:
         turned, tilt = _quarter(pose.yaw)
         half = half[::-1] if turned else half
         box = (z - asset.size_m[2] / 2, z + asset.size_m[2] / 2)
-        if item.host and item.host in scene.by_name:
+        on_rug = item.host in scene.by_name and scene.asset_of(item.host).category == "carpet"
+        if item.host in scene.by_name and not on_rug:
             host = kind_of(scene.asset_of(item.host).category)
             things.append((RoomBox(kind_of(asset.category), (x, y), half, tilt, *box, host), item.host))
         elif item.fixed and 2 * max(half) >= MIN_PIECE_M and box[0] < 0.1:

@@ -8,6 +8,7 @@ share of tasks that the oracle solves is a separate figure, because it also depe
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
 import time
@@ -24,6 +25,12 @@ import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
 from embomatrix.factory.evaluate.aesthetics import Calibration, score_room
+from embomatrix.factory.evaluate.furnishing import (
+    NOTHING_COUNTED,
+    FurnishingCounts,
+    furnishing_counts,
+    furnishing_figures,
+)
 from embomatrix.factory.evaluate.manipulation import out_of_hand
 from embomatrix.factory.evaluate.room_plans import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
@@ -170,8 +177,15 @@ def _beauty(imported: ImportedTask) -> float:
     return float(np.mean([score_room(plan_of(imported.scene, r), calibration) for r in imported.rooms]))
 
 
-def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, Any]) -> EvaluationFigures:
-    """Return the figures of all measured methods, with goals for the tree method, and the commonest reasons."""
+def evaluation_of(
+    outcomes: Sequence[LayoutOutcome],
+    conditions: Mapping[str, Any],
+    furnishing: FurnishingCounts = NOTHING_COUNTED,
+) -> EvaluationFigures:
+    """Return the figures of all measured methods and of the base scenes, and the commonest reasons for rejection.
+
+    Only the tree method has goals.
+    """
     figures: list[Figure] = []
     notes: list[str] = []
     for method in LayoutMethod:
@@ -181,7 +195,7 @@ def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, An
             reasons = Counter(outcome.reason for outcome in mine if outcome.reason)
             counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
             notes.append(f"Most common reasons for rejection, {method}: {counts}.")
-    return EvaluationFigures("scenes", conditions, tuple(figures), tuple(notes))
+    return EvaluationFigures("scenes", conditions, (*figures, *furnishing_figures(furnishing)), tuple(notes))
 
 
 def _shared_scores(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> list[float]:
@@ -271,7 +285,9 @@ def evaluate_scenes(
         "methods": ", ".join(methods),
         "time": "CPU seconds of one task from BDDL text to scene, base scene built before, execution after",
     }
-    return evaluation_of(outcomes, conditions), outcomes
+    counts = [furnishing_counts(build_base_scene(name)) for name in sorted({task.scene for task in tasks})]
+    total = functools.reduce(FurnishingCounts.plus, counts, NOTHING_COUNTED)
+    return evaluation_of(outcomes, conditions, total), outcomes
 
 
 def _judged(seed: int, library: PlacementLibrary, trials: Sequence[Trial]) -> list[LayoutOutcome]:

@@ -72,8 +72,8 @@ def _finish(rooms: Sequence[RoomSpec], packing: Packing, rng: np.random.Generato
     doors, unused = place_doorways(rooms, rects, packing.parents, rng)
     panes, walled_up = place_windows(rooms, rects, doors)
     plan = FloorPlan(
-        rooms=tuple(Room(s.name, s.type, *rects[s.name].floor) for s in rooms),
-        walls=build_walls(rects, doors, panes),
+        rooms=tuple(Room(s.name, s.type, *rects[s.name].floor, s.height_m) for s in rooms),
+        walls=build_walls(rects, doors, panes, {s.name: s.height_m for s in rooms}),
         doorways=tuple(cut.opening for cut in doors),
         windows=tuple(cut.opening for cut in panes),
         left_out=(*unused, *walled_up),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from embomatrix.world.geometry import Vec2
+from embomatrix.world.scene import ROOM_HEIGHT_M
 
 MIN_DOOR_M: Final = 0.8
 MAX_DOOR_HEIGHT_M: Final = 2.1
@@ -101,3 +102,4 @@ class RoomSpec:
     floor_m: Vec2
     doors: tuple[OpeningSpec, ...] = ()
     windows: tuple[OpeningSpec, ...] = ()
+    height_m: float = ROOM_HEIGHT_M

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final, Generic, NamedTuple, TypeVar
 
 from embomatrix.world.geometry import ConvexPart, Pose, Shape, Vec2
-from embomatrix.world.scene import Doorway, Window
+from embomatrix.world.scene import ROOM_HEIGHT_M, Doorway, Window
 
 WALL_M: Final = 0.12
-WALL_HEIGHT_M: Final = 2.4
 DOOR_LEAF_M: Final = 0.05
 PANE_M: Final = 0.02
 
@@ -113,34 +113,62 @@ def shared_edge(a: Rect, b: Rect) -> Edge | None:
     return None
 
 
+class WallHeights:
+    """Heights of the walls along each line: that of the higher room where two rooms share a wall."""
+
+    def __init__(self, rects: Mapping[str, Rect], heights_m: Mapping[str, float]) -> None:
+        """Collect the edges of the rooms; a room without a height in ``heights_m`` has the usual one."""
+        half = WALL_M / 2
+        self.lines: dict[tuple[str, float], list[tuple[float, Interval]]] = defaultdict(list)
+        for name, rect in rects.items():
+            for edge in rect.edges:
+                span = (edge.start - half, edge.end + half)
+                self.lines[edge.along, round(edge.at, 5)].append((heights_m.get(name, ROOM_HEIGHT_M), span))
+
+    def spans(self, along: str, at: float) -> Iterator[tuple[float, Interval]]:
+        """Yield disjoint stretches of a line with their heights, the highest first."""
+        found = self.lines[along, at]
+        higher: list[Interval] = []
+        for height in sorted({height for height, _ in found}, reverse=True):
+            merged = _merge(span for each, span in found if each == height)
+            yield from ((height, piece) for piece in subtract(merged, higher))
+            higher += merged
+
+    def of(self, edge: Edge, span: Interval) -> float:
+        """Return the height of the wall over an opening."""
+        found = self.lines[edge.along, round(edge.at, 5)]
+        return max(height for height, (start, end) in found if start < span[1] and end > span[0])
+
+
 def build_walls(
-    rects: Mapping[str, Rect], doors: Sequence[WallCut[Doorway]], windows: Sequence[WallCut[Window]] = ()
+    rects: Mapping[str, Rect],
+    doors: Sequence[WallCut[Doorway]],
+    windows: Sequence[WallCut[Window]] = (),
+    heights_m: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[ConvexPart, ...]:
     """Return wall panels, lintels of doorways, the closed panel of the exterior door, and sills, lintels and panes."""
-    half = WALL_M / 2
-    lines: dict[tuple[str, float], list[Interval]] = defaultdict(list)
-    for rect in rects.values():
-        for edge in rect.edges:
-            lines[edge.along, round(edge.at, 5)].append((edge.start - half, edge.end + half))
+    heights = WallHeights(rects, heights_m)
     holes: dict[tuple[str, float], list[Interval]] = defaultdict(list)
     cuts = [(door.edge, door.interval) for door in doors] + [(pane.edge, pane.interval) for pane in windows]
     for edge, interval in cuts:
         holes[edge.along, round(edge.at, 5)].append(interval)
     walls = [
-        _panel(along, at, piece, 0.0, WALL_HEIGHT_M)
-        for (along, at), spans in sorted(lines.items())
-        for piece in subtract(_merge(spans), holes[along, at])
+        _panel(along, at, piece, 0.0, height_m)
+        for along, at in sorted(heights.lines)
+        for height_m, span in heights.spans(along, at)
+        for piece in subtract([span], holes[along, at])
     ]
     for door in doors:
         height = door.opening.height_m
-        walls.append(_panel(door.edge.along, door.edge.at, door.interval, height, WALL_HEIGHT_M))
+        top = heights.of(door.edge, door.interval)
+        walls.append(_panel(door.edge.along, door.edge.at, door.interval, height, top))
         if not door.opening.rooms[1]:
             walls.append(_panel(door.edge.along, door.edge.at, door.interval, 0.0, height, DOOR_LEAF_M))
     for glazed in windows:
         along, at, span, window = glazed.edge.along, glazed.edge.at, glazed.interval, glazed.opening
         walls += [
             _panel(along, at, span, 0.0, window.sill_m),
-            _panel(along, at, span, window.head_m, WALL_HEIGHT_M),
+            _panel(along, at, span, window.head_m, heights.of(glazed.edge, span)),
             _panel(along, at, span, window.sill_m, window.head_m, PANE_M),
         ]
     return tuple(walls)

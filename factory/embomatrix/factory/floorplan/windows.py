@@ -23,7 +23,7 @@ GAP_M: Final = 0.25
 VIEW_M: Final = 0.8
 """Depth of free space behind a window."""
 SKYLIGHT_M: Final = 6.0
-"""Higher windows belong to a roof or facade: walls are 2.4 m high."""
+"""Higher windows belong to a roof or facade."""
 
 
 @dataclass(slots=True)

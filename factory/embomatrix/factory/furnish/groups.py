@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-from embomatrix.factory.furnish.halls import hall_groups, mat_rows, planting_groups
-from embomatrix.factory.furnish.hung import ceiling_groups, hung_groups, on_wall, rug_groups
+from embomatrix.factory.assets.corners import ARM_M, is_corner
+from embomatrix.factory.furnish.halls import hall_groups, planting_groups
+from embomatrix.factory.furnish.hung import on_wall
 from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, basin, run_groups, worktop
 from embomatrix.factory.furnish.pieces import (
-    CORNER_SOFA_M,
     FurnitureGroup,
     FurniturePiece,
     Member,
@@ -23,11 +23,10 @@ from embomatrix.factory.furnish.pieces import (
 )
 from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.factory.furnish.tables import table_groups, work_groups
+from embomatrix.world.scene import Room
 
 _COFFEE_GAP_M: Final = 0.38
 _PAIR: Final = 2
-_CORNER_SEAT_M: Final = 0.95
-"""Depth of both seats of a corner sofa; its table stands in the nook between them."""
 _TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
 _CLEAR_M: Final = 0.8
 """Free floor on all sides of furniture in the middle of a room."""
@@ -72,15 +71,15 @@ _OFF_FLOOR: Final = frozenset(
 
 
 def room_groups(
-    pieces: Sequence[FurniturePiece], room_type: str = "", floor_m: tuple[float, float] = (5.0, 5.0)
+    pieces: Sequence[FurniturePiece], room: Room
 ) -> tuple[list[FurnitureGroup | Rows], list[tuple[FurniturePiece, str]]]:
     """Return the groups of everything on the floor, important ones first, and the pieces that no group takes, with reasons."""
-    pool = Pool((p for p in pieces if p.role not in _OFF_FLOOR), room_type, floor_m)
+    pool = Pool((p for p in pieces if p.role not in _OFF_FLOOR), room.type, room.size_m)
     left_out: list[tuple[FurniturePiece, str]] = []
     screens = [p for p in pieces if p.category == "wall_mounted_tv"]
     found: list[FurnitureGroup | Rows] = [
         *_television(pool, [p for p in pieces if p.category == "standing_tv"]),
-        *(_first(on_wall(p)) for p in screens[:1] if pool.of("sofa")),
+        *(_first(on_wall(p, room.height_m)) for p in screens[:1] if pool.of("sofa")),
         *hall_groups(pool),
         *work_groups(pool),
         *run_groups(pool, left_out),
@@ -94,16 +93,8 @@ def room_groups(
     return found, left_out
 
 
-def hung_and_laid(pieces: Sequence[FurniturePiece], taken: set[int]) -> list[FurnitureGroup | Rows]:
-    """Return groups for walls and ceilings, then mats and rugs, without the pieces already ``taken``."""
-    rest = [p for p in pieces if p.number not in taken]
-    rugs = Pool(p for p in rest if p.role is FurnitureRole.RUG)
-    mats = mat_rows(rugs)
-    return [*hung_groups(rest), *ceiling_groups(rest), *mats, *rug_groups(rugs.rest)]
-
-
 def alone(piece: FurniturePiece) -> FurnitureGroup:
-    """Return a group of one piece for which its own group had no place: at a wall, on brackets, or hung at its height."""
+    """Return a group of one piece for which its own group had no place: at a wall, on side panels, or hung at its height."""
     if piece.role is FurnitureRole.COUNTERTOP:
         return worktop(piece)
     if piece.role is FurnitureRole.FITTED:
@@ -176,12 +167,12 @@ def _sofas(pool: Pool) -> list[FurnitureGroup]:
     each = len(armchairs) // max(1, len(sofas))
     for sofa in sofas:
         members = [Member(sofa)]
-        nook = min(sofa.size_m[:2]) > CORNER_SOFA_M
+        nook = is_corner(sofa.category, sofa.size_m)
         tables = [p for p in pool.of("coffee_table", "garden_coffee_table") if p.size_m[1] <= sofa.size_m[1]]
         for table in pool.take(tables[:1]):
             at = sofa.size_m[0] / 2 + _COFFEE_GAP_M + table.size_m[0] / 2
-            if nook and max(table.size_m[:2]) + 0.3 <= min(sofa.size_m[:2]) - _CORNER_SEAT_M:
-                members.append(Member(table, _CORNER_SEAT_M / 2 + 0.1, _CORNER_SEAT_M / 2 + 0.1))
+            if nook and max(table.size_m[:2]) + 0.3 <= min(sofa.size_m[:2]) - ARM_M["sofa"]:
+                members.append(Member(table, ARM_M["sofa"] / 2 + 0.1, ARM_M["sofa"] / 2 + 0.1))
                 continue
             members.append(Member(table, at))
             mine = pool.take(armchairs[: min(each, 2)])
@@ -223,6 +214,8 @@ def _singles(pool: Pool) -> list[FurnitureGroup]:
             and piece.role in (FurnitureRole.BACKED, FurnitureRole.RUN)
         ):
             near = (piece.category,)
+        if is_corner(piece.category, piece.size_m) and piece.category == "bench":
+            style = Style.NOOK
         if pool.room_type == "locker_room" and piece.category == "bench":
             style = Style.FREE
         clear = _CLEAR_M if style is Style.FREE else 0.0

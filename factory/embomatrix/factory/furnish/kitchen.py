@@ -116,7 +116,7 @@ def _counters(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
         else:
             left.append(slab)
     if left and not groups and pool.room_type != "kitchen":
-        # A worktop on brackets, as in a washroom or a copy room.
+        # A worktop on side panels, as in a washroom or a copy room.
         groups.append(worktop(left.pop(0)))
     left_out += [(slab, "no base cabinets are left to carry it") for slab in left]
     groups += [
@@ -239,12 +239,12 @@ def _evened(group: FurnitureGroup) -> FurnitureGroup:
 
 
 def worktop(slab: FurniturePiece) -> FurnitureGroup:
-    """Return a worktop on brackets at the wall, without cabinets under it."""
+    """Return a worktop on side panels at the wall, without cabinets under it."""
     return FurnitureGroup((Member(slab, bottom=_WORKTOP_M),), Style.RUN, 0.0, near=SINKS)
 
 
 def _with_chair(pool: Pool, group: FurnitureGroup) -> FurnitureGroup:
-    """Add a spare swivel chair to a worktop on brackets, unless a conference table needs the chairs."""
+    """Add a spare swivel chair to a worktop on side panels, unless a conference table needs the chairs."""
     slab = group.members[0]
     if (
         len(group.members) > 1

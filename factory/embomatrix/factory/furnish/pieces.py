@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from embomatrix.factory.assets.corners import is_corner
 from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
 from embomatrix.factory.furnish.space import Box, Rect4
 from embomatrix.sim.geometry.bounds import joint_motion
@@ -21,8 +22,6 @@ from embomatrix.world.asset import Asset, Link
 from embomatrix.world.geometry import ConvexPart, Pose, Vec3
 from embomatrix.world.state import Relation
 
-CORNER_SOFA_M: Final = 1.4
-"""A sofa larger than this along both sides is a corner sofa with its second arm on the right; its nook is open floor."""
 REST_GAP_M: Final = 0.0005
 """Gap between an object and its support: close enough to rest on it, too far to penetrate it."""
 FRONT_M: Final = 0.6
@@ -58,8 +57,8 @@ class FurniturePiece:
     @property
     def blocks(self) -> tuple[Box, ...]:
         """Boxes it occupies, relative to its centre and underside: one, or the parts of an open shape."""
-        corner = self.category == "sofa" and min(self.size_m[:2]) > CORNER_SOFA_M
-        if (corner or self.category in _OPEN_SHAPES) and not self.upended:
+        open_shape = self.category in _OPEN_SHAPES or is_corner(self.category, self.asset.size_m)
+        if open_shape and not self.upended:
             return _blocks_of(self.asset.links[0].parts, self.asset.size_m[2] / 2)
         x, y, z = (extent / 2 for extent in self.size_m)
         return ((-x, -y, 0.0, x, y, 2 * z),)

@@ -7,16 +7,22 @@ from typing import Final
 
 import numpy as np
 
+from embomatrix.factory.floorplan.ceilings import HEAD_ROOM_M
 from embomatrix.factory.floorplan.layout import FloorPlan
-from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
-from embomatrix.factory.furnish.groups import alone, hung_and_laid, in_the_open, room_groups
-from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Placed, Rows
+from embomatrix.factory.floorplan.spec import OUTDOORS
+from embomatrix.factory.furnish.groups import alone, in_the_open, room_groups
+from embomatrix.factory.furnish.halls import mat_rows
+from embomatrix.factory.furnish.hung import ceiling_groups, hung_groups, rug_groups
+from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Placed, Pool, Rows
 from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
+from embomatrix.factory.furnish.rugs import lay_rugs
 from embomatrix.factory.furnish.solver import RoomSolver, lay_rows
-from embomatrix.factory.furnish.space import RoomSpace
+from embomatrix.factory.furnish.space import Box, RoomSpace
 from embomatrix.factory.furnish.surfaces import SurfacePlacer
 from embomatrix.factory.furnish.tables import STOOLS
+from embomatrix.factory.furnish.worktops import side_panels
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.scene import Room
 
 ATTEMPTS: Final = 24
@@ -41,6 +47,7 @@ _CAPS: Final[Mapping[FurnitureRole, int]] = {
     FurnitureRole.PLANTING: MAX_PLANTS,
 }
 _ABOVE_FLOOR_M: Final = 0.1
+_RUG_WOBBLE: Final = 0.4
 _PAST_M: Final = 2 * ROBOT.radius_m + 0.1
 _LIGHT_LOSSES: Final = frozenset(
     (FurnitureRole.WALL, FurnitureRole.CEILING, FurnitureRole.RUG, FurnitureRole.PLANTING)
@@ -55,13 +62,15 @@ class Furnishing:
 
     placed: tuple[Placed, ...]
     left_out: tuple[str, ...]
+    panels: tuple[ConvexPart, ...] = ()
+    """Side panels of worktops without cabinets; they belong to the building."""
     loss: float = 0.0
     """Summed importance of the pieces without a place on floor, walls and ceilings."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    placed: tuple[Placed, ...]
+    solver: RoomSolver
     dropped: tuple[FurniturePiece, ...]
     unfit: tuple[tuple[FurniturePiece, str], ...]
     """Pieces that no group takes, with the reason."""
@@ -82,17 +91,24 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[FurniturePiece]], rng: np.ra
     loss = 0.0
     pieces = _moved(plan, pieces)
     for room in plan.rooms:
-        wanted, notes = _capped(pieces.get(room.name, []), room.name)
-        best = _best_arrangement(room, plan, wanted, rng)
+        wanted, notes = _capped(pieces.get(room.name, []), room)
+        best = _with_rugs(_best_arrangement(room, plan, wanted, rng), wanted, rng)
         start = len(placed)
         loss += best.loss
-        placed += [replace(p, host=p.host + start) if p.host >= 0 else p for p in best.placed]
+        placed += [replace(p, host=p.host + start) if p.host >= 0 else p for p in best.solver.placed]
         unplaced = _with_reasons(best.dropped, room)
         left_out += [*notes, *_sentences(best.unfit, room.name), *_sentences(unplaced, room.name)]
-        done = {p.piece.number for p in best.placed} | {p.number for p in best.dropped}
+        done = {p.piece.number for p in best.solver.placed} | {p.number for p in best.dropped}
         small += [(room.name, p) for p in wanted if p.role is FurnitureRole.SURFACE and p.number not in done]
     left_out += _set_small_things(plan, placed, small, rng)
-    return Furnishing(tuple(placed), tuple(left_out), loss)
+    panels = tuple(_solid(box) for item in placed for box in side_panels(item))
+    return Furnishing(tuple(placed), tuple(left_out), panels, loss)
+
+
+def _solid(box: Box) -> ConvexPart:
+    x0, y0, z0, x1, y1, z1 = box
+    middle = ((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2)
+    return ConvexPart(Shape.BOX, Pose(middle), (x1 - x0, y1 - y0, z1 - z0))
 
 
 def _moved(
@@ -117,40 +133,44 @@ def _has_room(piece: FurniturePiece, room: Room) -> bool:
     return short + _PAST_M <= min(room.size_m) and long <= max(room.size_m)
 
 
-def _capped(pieces: Sequence[FurniturePiece], room: str) -> tuple[list[FurniturePiece], list[str]]:
-    """Return as many pieces of each model as `_CAPS` allows, without parts of the building; and sentences on the rest."""
+def _capped(pieces: Sequence[FurniturePiece], room: Room) -> tuple[list[FurniturePiece], list[str]]:
+    """Return as many pieces of each model as `_CAPS` allows, those in their place only; and sentences on the rest."""
     kept: list[FurniturePiece] = []
     totals = Counter(p.asset.asset_id for p in pieces)
     seen: Counter[str] = Counter()
     for piece in pieces:
         seen[piece.asset.asset_id] += 1
         most = _CAPS.get(piece.role, MAX_FURNITURE)
-        belongs = piece.role is not FurnitureRole.STRUCTURE and not _too_high(piece)
-        if belongs and seen[piece.asset.asset_id] <= most:
+        if not _out_of_place(piece, room) and seen[piece.asset.asset_id] <= most:
             kept.append(piece)
     notes = []
     for piece in {p.asset.asset_id: p for p in pieces}.values():
         asset_id, total = piece.asset.asset_id, totals[piece.asset.asset_id]
         most = _CAPS.get(piece.role, MAX_FURNITURE)
-        if piece.role is FurnitureRole.STRUCTURE:
-            notes.append(
-                f"{total} {asset_id} in {room}: part of the building, which floor and walls stand for"
-            )
-        elif _too_high(piece):
-            notes.append(f"{total} {asset_id} in {room}: it hangs, and is higher than the room")
+        if reason := _out_of_place(piece, room):
+            notes.append(f"{total} {asset_id} in {room.name}: {reason}")
         elif total > most:
             notes.append(
-                f"{total - most} of {total} {asset_id} in {room}: at most {most} of a model in a room"
+                f"{total - most} of {total} {asset_id} in {room.name}: at most {most} of a model in a room"
             )
     return kept, notes
 
 
-def _too_high(piece: FurniturePiece) -> bool:
-    """True if an object for wall or ceiling is higher than the room: lamps of a hall, screens of a theatre."""
-    return (
-        piece.role in (FurnitureRole.WALL, FurnitureRole.CEILING)
-        and piece.size_m[2] > WALL_HEIGHT_M - _ABOVE_FLOOR_M
-    )
+def _out_of_place(piece: FurniturePiece, room: Room) -> str:
+    """Return the reason for which no room, or not this one, can hold the piece; "" if it can."""
+    outdoors = room.type in OUTDOORS
+    match piece.role:
+        case FurnitureRole.STRUCTURE:
+            return "part of the building, which floor and walls stand for"
+        case FurnitureRole.PLANTING if not outdoors:
+            return "it grows outdoors, and the room is indoors"
+        case FurnitureRole.CEILING if outdoors:
+            return "it hangs from a ceiling, and a garden has none"
+        case FurnitureRole.CEILING if piece.size_m[2] > room.height_m - HEAD_ROOM_M:
+            return "it would hang into the way of people's heads"
+        case FurnitureRole.WALL if piece.size_m[2] > room.height_m - _ABOVE_FLOOR_M:
+            return "it hangs, and is higher than the room"
+    return ""
 
 
 def _best_arrangement(
@@ -180,7 +200,7 @@ def _arrange(
     wobble: float,
 ) -> _Arrangement:
     solver = RoomSolver(RoomSpace(room, plan.doorways, plan.windows), rng)
-    groups, unfit = room_groups(pieces, room.type, room.size_m)
+    groups, unfit = room_groups(pieces, room)
     groups.sort(key=lambda g: all(m.piece.number not in first for m in _members(g)))
     dropped = _place_all(solver, groups, wobble, rng)
     # Pieces dropped from a group may still find a place alone: a chair at the wall, an armchair in the corner.
@@ -188,8 +208,21 @@ def _arrange(
     walls = [p for p in dropped if in_the_open(p) is None]
     dropped = walls + _place_all(solver, [g for p in dropped if (g := in_the_open(p))], wobble, rng)
     taken = {p.piece.number for p in solver.placed} | {p.number for p in dropped}
-    dropped += _place_all(solver, hung_and_laid(pieces, taken), wobble, rng)
-    return _Arrangement(tuple(solver.placed), tuple(dropped), tuple(unfit))
+    rest = [p for p in pieces if p.number not in taken]
+    hung = (*hung_groups(rest, room.height_m), *ceiling_groups(rest, room.height_m))
+    dropped += _place_all(solver, hung, wobble, rng)
+    return _Arrangement(solver, tuple(dropped), tuple(unfit))
+
+
+def _with_rugs(
+    best: _Arrangement, pieces: Iterable[FurniturePiece], rng: np.random.Generator
+) -> _Arrangement:
+    """Lay mats in rows, rugs under furniture, and the rest on free floor of the arrangement that was chosen."""
+    pool = Pool(p for p in pieces if p.role is FurnitureRole.RUG)
+    dropped = _place_all(best.solver, mat_rows(pool), _RUG_WOBBLE, rng)
+    rugs = lay_rugs(best.solver, pool.take(pool.of("carpet")))
+    dropped += _place_all(best.solver, rug_groups([*rugs, *pool.rest]), _RUG_WOBBLE, rng)
+    return replace(best, dropped=(*best.dropped, *dropped))
 
 
 def _place_all(

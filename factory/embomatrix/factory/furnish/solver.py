@@ -201,14 +201,14 @@ def _yaw(turns: int) -> float:
     return (0.0, math.pi / 2, math.pi, -math.pi / 2)[turns % 4]
 
 
-def _on_brackets(piece: FurniturePiece, host: int) -> bool:
-    """True for a worktop on brackets: the space below it is for knees, not for furniture."""
+def _on_panels(piece: FurniturePiece, host: int) -> bool:
+    """True for a worktop on side panels: the space below it is for knees, not for furniture."""
     return piece.role is FurnitureRole.COUNTERTOP and host < 0
 
 
 def _with_knee_room(item: Placed, box: Box) -> Box:
     """Return the box of a piece, extended down to the floor if nothing may stand under it."""
-    return (*box[:2], 0.0, *box[3:]) if _on_brackets(item.piece, item.host) else box
+    return (*box[:2], 0.0, *box[3:]) if _on_panels(item.piece, item.host) else box
 
 
 def _seen(member: Member, boxes: FloatArray) -> FloatArray:
@@ -225,7 +225,7 @@ def _grown(boxes: FloatArray, by_m: float) -> FloatArray:
 def _boxes(member: Member, options: GroupFrames) -> Iterator[FloatArray]:
     """Yield the world boxes of each of the member's blocks for every candidate, shape (n, 6)."""
     for x0, y0, z0, x1, y1, z1 in member.piece.blocks:
-        low = 0.0 if _on_brackets(member.piece, member.on) else member.bottom + z0
+        low = 0.0 if _on_panels(member.piece, member.on) else member.bottom + z0
         yield _turned(member, options, (x0, y0, x1, y1), (low, member.bottom + z1))
 
 

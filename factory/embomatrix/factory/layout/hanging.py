@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 
-from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of, wall_height_m
 from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
 from embomatrix.factory.scenes.floor import box_at
@@ -48,7 +47,7 @@ class Hanger:
     def under_ceiling(self, asset: Asset) -> Pose:
         """Return a pose under the ceiling, near the room's centre first. Reach is not required. Raise PlacementError."""
         (cx, cy), (sx, sy) = self._room.center_m, self._room.size_m
-        z = WALL_HEIGHT_M - GAP_M - bounds_of(asset).box(IDENTITY).high_m[2]
+        z = self._room.height_m - GAP_M - bounds_of(asset).box(IDENTITY).high_m[2]
         for number in range(TRIES):
             spread = 0.4 * number / TRIES
             x, y = self._rng.uniform(-spread, spread, 2)
@@ -66,7 +65,7 @@ class Hanger:
             middle = HUNG_BOTTOM_M + height / 2
         else:
             middle = min(wall_height_m(asset.category), ROBOT.reach_high_m - SPARE_M)
-        z = min(max(middle, height / 2 + SPARE_M), WALL_HEIGHT_M - height / 2 - GAP_M)
+        z = min(max(middle, height / 2 + SPARE_M), self._room.height_m - height / 2 - GAP_M)
         for _ in range(TRIES):
             axis, sign = int(self._rng.integers(2)), (1, -1)[int(self._rng.integers(2))]
             low, high = self._room.low_m[1 - axis], self._room.high_m[1 - axis]

@@ -3,7 +3,7 @@
 import logging
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.clutter.background import with_background
+from embomatrix.factory.floorplan.ceilings import ceiling_height_m
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
 from embomatrix.factory.floorplan.spec import OpeningSpec, RoomSpec
 from embomatrix.factory.furnish.pieces import FurniturePiece, Placed
@@ -63,7 +64,7 @@ def build_base_scene(
         base=scene_id,
         seed=seed,
         rooms=plan.rooms,
-        walls=plan.walls,
+        walls=(*plan.walls, *result.panels),
         doorways=plan.doorways,
         objects=objects,
         assets=assets,
@@ -105,7 +106,7 @@ def _best_plan(
 
 
 def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
-    """Return floor, doors and windows of an inventory's room, each repeated as often as it is listed."""
+    """Return floor, height, doors and windows of an inventory's room; openings are repeated as often as they are listed."""
     doors = []
     for category, model, count in room.doors:
         _, width, height = catalog.model(category, model).size_m
@@ -116,7 +117,16 @@ def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
         # The catalog lists flat models lying on their back: the face is at the top.
         face = (depth, width) if height < 0.1 else (max(depth, width), height)
         windows += [OpeningSpec(model, *face)] * count
-    return RoomSpec(room.name, room.type, room.floor_m, tuple(doors), tuple(windows))
+    height_m = ceiling_height_m(room.type, room.floor_m, _hanging(catalog, room))
+    return RoomSpec(room.name, room.type, room.floor_m, tuple(doors), tuple(windows), height_m)
+
+
+def _hanging(catalog: Catalog, room: RoomInventory) -> Iterator[float]:
+    """Yield the heights of the room's objects that hang from the ceiling."""
+    for category, model, _ in room.items:
+        size_m = catalog.model(category, model).size_m
+        if role_of(category, size_m, catalog.category(category).mass_kg) is FurnitureRole.CEILING:
+            yield size_m[2]
 
 
 def _pieces(

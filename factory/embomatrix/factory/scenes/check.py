@@ -25,7 +25,6 @@ from embomatrix.world.state import Relation
 
 REST_M: Final = 0.002
 HANG_M: Final = 0.03
-CEILING_M: Final = 2.4
 CUT_OFF_M2: Final = 1.0
 CUT_OFF_SHARE: Final = 0.01
 """Limits for unreachable floor on which the robot fits, per room: exceeding both means a blocked aisle."""
@@ -176,7 +175,7 @@ def _hangs(scene: Scene, item: SceneObject, box: Aabb) -> bool:
     if not item.fixed:
         return False
     room = next((r for r in scene.rooms if r.name == item.room), None)
-    if room is None or box.high_m[2] > CEILING_M - HANG_M:
+    if room is None or box.high_m[2] > room.height_m - HANG_M:
         return room is not None
     gaps = (
         *(abs(low - edge) for low, edge in zip(box.low_m, room.low_m, strict=False)),

@@ -19,14 +19,14 @@ _TOUCH_M: Final = 1e-3
 
 
 class Clearance:
-    """Test of a scene's objects against the clear zones. Objects that rest on furniture are ignored."""
+    """Test of a scene's objects against the clear zones. Objects that rest on furniture are ignored, except on a rug."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._rooms = {room.name: room for room in scene.rooms}
         rows, names = [], []
         for item in scene.objects:
-            if item.host:
+            if item.host and not _lies_flat(scene, item.host):
                 continue
             for link in scene.assets[item.asset_id].links:
                 for part in link.parts:
@@ -90,6 +90,11 @@ class Clearance:
     def _within(self, zone: FloatArray) -> tuple[str, ...]:
         hits = np.flatnonzero(_overlap(self._boxes, zone))
         return tuple(dict.fromkeys(self._names[hit] for hit in hits))
+
+
+def _lies_flat(scene: Scene, name: str) -> bool:
+    """True for a rug, which counts as floor."""
+    return name in scene.by_name and scene.box_of(name).high_m[2] <= LOW_M
 
 
 def _overlap(boxes: FloatArray, zone: FloatArray) -> BoolArray:
