@@ -108,7 +108,7 @@ class VisualScene:
         for item in self.scene.background:
             asset = self.scene.assets[item.asset_id]
             # Books of one category stand side by side: each model has its own colour.
-            color = _hue(zlib.crc32(item.asset_id.encode()) / 2**32) if is_small(asset) else color_of(asset)
+            color = _hue(zlib.crc32(item.asset_id.encode()) / 2**32) if is_small(asset) else _color_of(asset)
             for link in asset.links:
                 for part in link.parts:
                     self._add_part(part, item.pose_world_asset, color)
