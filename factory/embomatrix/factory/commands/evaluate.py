@@ -20,6 +20,7 @@ from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
+from embomatrix.factory.evaluate.skills import evaluate_skills, needed_in_dataset
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -39,13 +40,13 @@ def evaluate(
     parts: Annotated[
         list[str],
         typer.Argument(
-            help="Parts to measure: tasks, scenes, looks, admission, aesthetics. A .json file of figures is read instead."
+            help="Parts to measure: tasks, scenes, looks, admission, skills, aesthetics. A .json file is read instead."
         ),
     ],
     dataset: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset for the parts tasks and admission. Default for tasks: draft tasks with both writers."
+            help="Dataset for the parts tasks, admission and skills. Default for tasks: draft tasks with both writers."
         ),
     ] = None,
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
@@ -53,12 +54,14 @@ def evaluate(
         Path | None,
         typer.Option(help="JSON lines file with the paper's sample of tasks, for scenes and looks."),
     ] = None,
-    only: Annotated[int, typer.Option(min=1, help="Use only every n-th of the 140 tasks.")] = 1,
+    only: Annotated[
+        int, typer.Option(min=1, help="Use only every n-th of the 140 tasks, or of a dataset's for skills.")
+    ] = 1,
     outcomes: Annotated[
         Path | None,
         typer.Option(help="JSON lines file for the outcomes of scenes; an interrupted run resumes from it."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes and skills.")] = 1,
     rooms: Annotated[
         Path | None, typer.Option(help="Gzipped JSON file with hand-made rooms, for aesthetics.")
     ] = None,
@@ -75,7 +78,7 @@ def evaluate(
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
     ] = None,
 ) -> None:
-    """Measure parts of the factory: diversity of tasks, layouts of fixed tasks, admission of drafts, aesthetics.
+    """Measure parts of the factory: diversity of tasks, layouts of fixed tasks, admission of drafts, needed skills, aesthetics.
 
     A language model judges looks, and also tasks if one is given.
     """
@@ -85,6 +88,7 @@ def evaluate(
         "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes),
         "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
+        "skills": lambda: _skills(_given(dataset, "--dataset FOLDER"), only, jobs),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
     check_output(page)
@@ -173,6 +177,13 @@ async def _looks(judge: Judge, tasks: Sequence[SourceText], seed: int) -> Evalua
     async with judge as model:
         with counter("trials", len(tasks) * len(METHODS)) as count:
             return await evaluate_looks(model, tasks, METHODS, seed, count)
+
+
+def _skills(folder: Path, only: int, jobs: int) -> EvaluationFigures:
+    """Measure the share of a dataset's tasks that need each skill."""
+    records = Dataset.load(folder).records[::only]
+    with counter("tasks", len(records)) as count:
+        return evaluate_skills(folder, needed_in_dataset(folder, records, jobs, count))
 
 
 def _aesthetics(rooms: Path, seed: int, calibration: Path | None) -> EvaluationFigures:
