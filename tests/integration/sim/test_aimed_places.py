@@ -21,7 +21,7 @@ SIMULATORS = {"cached": load_simulator, "physical": physical_simulator}
 def furnished():
     """The flat with a shoe and a lunch box on the kitchen table, a bag on a bench, a desk, and a rack on a low table."""
     shoe = replace(make.block("shoe", "shoe.n.01", (0.28, 0.11, 0.1), {}), mass_kg=0.4)
-    bag = make.tub("bag", "bag.n.06", (0.36, 0.26, 0.22), 0.01, 0.01, mass_kg=0.6, abilities={})
+    bag = make.tub("bag", "bag.n.06", (0.36, 0.24, 0.28), 0.01, 0.01, mass_kg=0.6, abilities={})
     box = make.tub("lunch_box", "lunch_box.n.01", (0.18, 0.14, 0.1), 0.008, 0.008, mass_kg=0.3, abilities={})
     bench, desk = (
         make.table("bench", "bench.n.01", (1.0, 0.4, 0.45)),
