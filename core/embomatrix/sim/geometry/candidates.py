@@ -139,15 +139,18 @@ def beside(held: Asset, support: Asset, relation: Relation, neighbour: Aabb) -> 
                 yield pose
 
 
-def places_beside(box: Aabb, neighbour: Aabb, gap_m: float) -> Iterator[Vec2]:
+def places_beside(box: Aabb, neighbour: Aabb, gap_m: float, shares: Sequence[float] = ()) -> Iterator[Vec2]:
     """Positions of an object at which there is a gap between a neighbour's box and its own, along each side of the neighbour.
 
-    ``box`` is the object's own with its origin at zero.
+    ``box`` is the object's own with its origin at zero. ``shares`` are further offsets from the middle of a side: at 1 the
+    object stands at the corner.
     """
     middle = neighbour.center_m
     for axis, sign in itertools.product((0, 1), (1, -1)):
         off = (neighbour.size_m[axis] + box.size_m[axis]) / 2 + gap_m
-        for along in _along(neighbour.size_m[1 - axis], box.size_m[1 - axis]):
+        side_m, extent_m = neighbour.size_m[1 - axis], box.size_m[1 - axis]
+        further = (share * (side_m + extent_m) / 2 for share in shares)
+        for along in (*_along(side_m, extent_m), *further):
             place = [0.0, 0.0]
             place[axis] = middle[axis] + sign * off - box.center_m[axis]
             place[1 - axis] = middle[1 - axis] + along - box.center_m[1 - axis]

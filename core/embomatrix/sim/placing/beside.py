@@ -32,6 +32,11 @@ from embomatrix.world.state import Relation
 WIDE_SHARE: Final = 0.6
 """Share of the largest gap of ``nextto`` that leaves room for the hand between both objects."""
 
+OFFSETS: Final = (0.5, -0.5, 1.0, -1.0)
+"""Offsets along a side, up to the corners, for objects whose surroundings are crowded."""
+TRIES: Final = 2 * LIVE_TRIES
+"""Candidates to examine: each costs a test for contacts."""
+
 
 @dataclass(frozen=True)
 class BesidePoses:
@@ -65,7 +70,7 @@ class BesideSearch:
         found = self._around
         order = range(len(found.poses)) if rng is None else rng.permutation(len(found.poses)).tolist()
         settles = 0
-        for number in self._roomy_first(order)[:LIVE_TRIES]:
+        for number in self._roomy_first(order)[:TRIES]:
             self.engine.set_pose(self.held, found.poses[number])
             if self.engine.penetrates(self.held) or not self._is_beside():
                 continue
@@ -114,7 +119,7 @@ class BesideSearch:
             box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw), joints)
             height_m = low_m - box.low_m[2] + LIFT_M
             for gap_m in (BESIDE_M, WIDE_SHARE * next_gap_m(box, around)):
-                for along, across in places_beside(box, around, gap_m):
+                for along, across in places_beside(box, around, gap_m, OFFSETS):
                     poses.append(frame @ Pose.from_xyz_yaw(along, across, height_m, yaw))
                     boxes.append(bounds.box(poses[-1], joints))
         lows, highs = (np.array([getattr(box, name) for box in boxes]) for name in ("low_m", "high_m"))
