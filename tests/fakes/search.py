@@ -128,7 +128,7 @@ def atoms_over(scene: Scene) -> tuple[Atom, ...]:
 
 
 def beside_atoms(scene: Scene) -> tuple[Atom, ...]:
-    """Return atoms that are no skill's target."""
+    """Return atoms about neighbours, which most states share."""
     small = [item.name for item in scene.objects if not item.fixed]
     return tuple(
         Atom(relation.value, (a, item.name))

@@ -15,6 +15,7 @@ PLACES = {
     PlaceRelation.INSIDE: "RIGHT_PLACE_INSIDE",
     PlaceRelation.ONTOP: "RIGHT_PLACE_ONTOP",
     PlaceRelation.UNDER: "RIGHT_PLACE_UNDER",
+    PlaceRelation.NEXTTO: "RIGHT_PLACE_NEXTTO",
 }
 DEEDS = {
     Skill.PICK_UP: "RIGHT_GRASP",

@@ -148,10 +148,6 @@ class _CallWriter:
                 yield from self._carry(thing, place, PlaceRelation(predicate))
             case Relation.TOUCHING, True if place is not None:
                 yield from self._carry(thing, place, PlaceRelation.ONTOP)
-            case Relation.NEXTTO, True if place is not None and place.host in self._rows:
-                host, relation = self._places[place.name]
-                if host in self._rows and relation is not None:
-                    yield from self._carry(thing, self._rows[host], PlaceRelation(relation.value))
             case State.OPEN, wanted:
                 yield from self._open(thing) if wanted else self._close(thing)
             case State.TOGGLED_ON, wanted:

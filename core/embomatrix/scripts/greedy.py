@@ -70,13 +70,10 @@ class SubgoalCalls:
         if len(rows) != len(args):
             return
         match predicate, rows:
-            case Relation.INSIDE | Relation.ONTOP | Relation.UNDER, [item, place]:
+            case Relation.INSIDE | Relation.ONTOP | Relation.UNDER | Relation.NEXTTO, [item, place]:
                 yield from self.carry(item, place, PlaceRelation(predicate))
             case Relation.TOUCHING, [item, place]:
                 yield from self.carry(item, place, PlaceRelation.ONTOP)
-            case Relation.NEXTTO, [item, other] if other.host in self._rows and other.relation is not None:
-                place = self._rows[other.host]
-                yield from self.carry(item, place, PlaceRelation(other.relation.value))
             case State.OPEN, [item] if "closed" in item.states:
                 yield from calls_at(item, Skill.OPEN)
             case State.TOGGLED_ON, [item] if "off" in item.states:

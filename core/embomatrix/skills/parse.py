@@ -60,7 +60,7 @@ _JSON_START: Final = re.compile(r"\[\s*\{|\{\s*\"")
 _LIST_MARK: Final = re.compile(r"^\s*(?:\d+[.)]|[-*])\s+")
 _WORD: Final = re.compile(r"[A-Za-z_]+")
 _ARGUMENT: Final = re.compile(
-    r"[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|nan|inf|infinity)|ontop|inside|under", re.IGNORECASE
+    r"[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|nan|inf|infinity)|ontop|inside|under|nextto", re.IGNORECASE
 )
 
 

@@ -52,6 +52,7 @@ class PlaceRelation(StrEnum):
     ONTOP = "ontop"
     INSIDE = "inside"
     UNDER = "under"
+    NEXTTO = "nextto"
 
 
 SIGNATURES: Final[Mapping[Skill, tuple[Arg, ...]]] = {

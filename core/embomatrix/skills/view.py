@@ -124,4 +124,10 @@ def metres(value: float) -> str:
 
 def preposition(relation: PlaceRelation) -> str:
     """Format a relation for a sentence."""
-    return "on top of" if relation is PlaceRelation.ONTOP else relation.value
+    match relation:
+        case PlaceRelation.ONTOP:
+            return "on top of"
+        case PlaceRelation.NEXTTO:
+            return "next to"
+        case _:
+            return relation.value

@@ -26,6 +26,8 @@ PAIRS = (
     ("mug_1", "coffee_table_1", Relation.ONTOP),
     ("bowl_1", "breakfast_table_1", Relation.UNDER),
     ("mug_1", "sink_1", Relation.INSIDE),
+    ("apple_1", "microwave_1", Relation.NEXTTO),
+    ("mug_1", "fridge_1", Relation.NEXTTO),
 )
 
 

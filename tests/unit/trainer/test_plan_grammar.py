@@ -109,6 +109,19 @@ def test_unique_name_without_a_number_gets_none():
     assert next_words(situation, f"open {situation.rows[0].category}") == {"\n", "<end>"}
 
 
+def test_vocabulary_of_an_older_checkpoint_offers_the_relations_that_it_has():
+    older = replace(WORDS, words=tuple(word for word in WORDS.words if word != "nextto"))
+    grammar = PlanGrammar(older, torch.device("cpu"))
+    situation = TASKS.train[0].situation
+    prompt = older.encode(prompt_for(situation, Codec.NAMES).user)
+    names = grammar.prompt_names(torch.tensor([prompt]))
+    state = grammar.start(1)
+    for token in older.encode(f"place {situation.rows[0].category}"):
+        state = grammar.advance(state, torch.tensor([token]))
+    allowed = (~grammar.token_mask(state, names)[0]).nonzero()[:, 0].tolist()
+    assert {older.words[token] for token in allowed} == {"ontop", "inside", "under"}
+
+
 def test_objects_only_in_the_instruction_are_masked():
     situation = TASKS.train[0].situation
     gone = situation.rows[0].category
@@ -120,7 +133,7 @@ def test_objects_only_in_the_instruction_are_masked():
 def test_arguments_follow_the_signature_of_the_skill():
     situation = TASKS.train[0].situation
     kind = situation.rows[0].category
-    assert next_words(situation, f"place {kind}") == {"ontop", "inside", "under"}
+    assert next_words(situation, f"place {kind}") == {"ontop", "inside", "under", "nextto"}
     assert kind in next_words(situation, f"heat_object_with_source {kind}")
     assert "1.57" in next_words(situation, "turn")
     assert next_words(situation, "turn 1.57") == {"\n", "<end>"}

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.skills.appliances import cold_source, heat_source, starts_closed
 from embomatrix.skills.check import check, within_reach
 from embomatrix.skills.syntax import PROFILES, PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.task import Profile, Task
 
 if TYPE_CHECKING:
@@ -31,8 +32,8 @@ ABILITY: Final[Mapping[Skill, str]] = {
     Skill.COOK: "cookable",
     Skill.FREEZE: "freezable",
 }
-RELATIONS: Final = (PlaceRelation.ONTOP, PlaceRelation.INSIDE, PlaceRelation.UNDER)
-RELATION_SHARES: Final = (0.5, 0.35, 0.15)
+RELATIONS: Final = tuple(PlaceRelation)
+RELATION_SHARES: Final = (0.4, 0.3, 0.15, 0.15)
 STEP_M: Final = (0.1, 1.5)
 """Range of the length of a straight drive."""
 
@@ -152,7 +153,13 @@ class PlanSampler:
 
     def _may_hold(self, row: int, relation: PlaceRelation) -> bool:
         asset = self._world.asset(self._task.table[row])
-        return bool(asset.interiors if relation is PlaceRelation.INSIDE else asset.open_supports)
+        match relation:
+            case PlaceRelation.INSIDE:
+                return bool(asset.interiors)
+            case PlaceRelation.NEXTTO:
+                return asset.category != FLOOR_CATEGORY
+            case _:
+                return bool(asset.open_supports)
 
     def _free_hand(self) -> bool:
         """Put the held object on any surface."""

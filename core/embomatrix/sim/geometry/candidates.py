@@ -25,7 +25,7 @@ SUPPORTED_SHARE: Final = 0.6
 BESIDE_M: Final = 0.02
 """Gap beside a neighbour: less than half of what ``nextto`` allows the smallest object, more than contact."""
 PLACE_RELATIONS: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
-"""Relations that placing creates."""
+"""Relations that placing on, in or under a support creates. Places next to an object depend on its surroundings."""
 YAWS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 """Objects stand square to their support."""
 
@@ -129,20 +129,32 @@ def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tri
 def beside(held: Asset, support: Asset, relation: Relation, neighbour: Aabb) -> Iterator[Pose]:
     """Poses with the relation right beside a box in the support's frame, along each of its sides."""
     bounds = bounds_of(held)
-    middle = neighbour.center_m
     for patch in patches(bounds, support, relation):
         if patch.link:
             continue  # a drawer's contents move away from static neighbours
         box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, patch.yaw))
-        for axis, sign in itertools.product((0, 1), (1, -1)):
-            off = (neighbour.size_m[axis] + box.size_m[axis]) / 2 + BESIDE_M
-            for along in _along(neighbour.size_m[1 - axis], box.size_m[1 - axis]):
-                place = [0.0, 0.0]
-                place[axis] = middle[axis] + sign * off - box.center_m[axis]
-                place[1 - axis] = middle[1 - axis] + along - box.center_m[1 - axis]
-                pose = Pose.from_xyz_yaw(place[0], place[1], patch.center_m[2], patch.yaw)
-                if _within(patch, place) and _stands(bounds.box(pose), support, relation):
-                    yield pose
+        for place in places_beside(box, neighbour, BESIDE_M):
+            pose = Pose.from_xyz_yaw(*place, patch.center_m[2], patch.yaw)
+            if _within(patch, place) and _stands(bounds.box(pose), support, relation):
+                yield pose
+
+
+def places_beside(box: Aabb, neighbour: Aabb, gap_m: float, shares: Sequence[float] = ()) -> Iterator[Vec2]:
+    """Positions of an object at which there is a gap between a neighbour's box and its own, along each side of the neighbour.
+
+    ``box`` is the object's own with its origin at zero. ``shares`` are further offsets from the middle of a side: at 1 the
+    object stands at the corner.
+    """
+    middle = neighbour.center_m
+    for axis, sign in itertools.product((0, 1), (1, -1)):
+        off = (neighbour.size_m[axis] + box.size_m[axis]) / 2 + gap_m
+        side_m, extent_m = neighbour.size_m[1 - axis], box.size_m[1 - axis]
+        further = (share * (side_m + extent_m) / 2 for share in shares)
+        for along in (*_along(side_m, extent_m), *further):
+            place = [0.0, 0.0]
+            place[axis] = middle[axis] + sign * off - box.center_m[axis]
+            place[1 - axis] = middle[1 - axis] + along - box.center_m[1 - axis]
+            yield (place[0], place[1])
 
 
 def _along(side_m: float, extent_m: float) -> list[float]:

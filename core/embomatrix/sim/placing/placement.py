@@ -11,6 +11,7 @@ from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import PLACE_RELATIONS, YAWS, candidates
 from embomatrix.sim.geometry.surfaces import is_upright, links_with_surfaces
+from embomatrix.sim.placing.beside import BesideSearch
 from embomatrix.sim.placing.loaded_places import MovedObjects, loaded_places
 from embomatrix.sim.placing.options import PlacementOptions
 from embomatrix.sim.placing.search import LIVE_TRIES, PlacementSearch, link_frames
@@ -121,7 +122,7 @@ class Placer:
         rng: np.random.Generator | None = None,
         excluded_stands: tuple[StandPose, ...] = (),
     ) -> Pose | FailureReason:
-        """Return a pose for a parked object on, in or under another, or the reason for none.
+        """Return a pose for a parked object on, in, under or next to another, or the reason for none.
 
         ``rng`` orders the poses; without one the cache's order holds. Poses within reach of ``excluded_stands`` are skipped.
         The world is left unchanged. Raises EngineError for unknown names.
@@ -143,6 +144,8 @@ class Placer:
         """First poses in the order of ``find``, at least one and at most ``most``."""
         if held == target or self._engine.is_parked(target):
             return FailureReason.PLACE_ON_ITSELF
+        if relation is Relation.NEXTTO:
+            return self._choices_beside(held, target, robot, rng, most, excluded_stands)
         fails = FailureReason.NO_CAVITY if relation is Relation.INSIDE else FailureReason.NO_SURFACE
         if not is_upright(self._engine.pose(target)):
             return fails
@@ -153,6 +156,21 @@ class Placer:
         if found:
             return found
         return FailureReason.NO_FREE_POSE if self._fits(held, target, relation) else fails
+
+    def _choices_beside(
+        self,
+        held: str,
+        target: str,
+        robot: StandPose,
+        rng: np.random.Generator | None,
+        most: int,
+        excluded_stands: tuple[StandPose, ...],
+    ) -> tuple[Pose, ...] | FailureReason:
+        search = self._beside(held, target, robot, excluded_stands)
+        found = self._first(most, held, self._takeable_first(search, search.poses(rng)))
+        if found:
+            return found
+        return FailureReason.NO_FREE_POSE if search.fits() else FailureReason.NO_SURFACE
 
     def hindrance(
         self, held: str, target: str, relation: Relation, stands: Sequence[StandPose]
@@ -165,7 +183,10 @@ class Placer:
         before = self._engine.pose(held)
         try:
             for stand in stands:
-                answer = self._search(held, target, relation, stand).hindrance()
+                if relation is Relation.NEXTTO:
+                    answer = self._beside(held, target, stand).hindrance()
+                else:
+                    answer = self._search(held, target, relation, stand).hindrance()
                 if answer[0] is FailureReason.NO_FREE_POSE:
                     return answer
                 if answer[0] is FailureReason.PLACES_BEHIND_DOOR:
@@ -219,6 +240,15 @@ class Placer:
             excluded,
         )
 
+    def _beside(
+        self, held: str, target: str, robot: StandPose, excluded: tuple[StandPose, ...] = ()
+    ) -> BesideSearch:
+        host = self._relations.host_of(target)
+        around = self._search(held, host.name, host.relation, robot) if host is not None else None
+        return BesideSearch(
+            self._engine, self._relations, self.options, held, target, robot, around, excluded
+        )
+
     def _fits(self, held: str, target: str, relation: Relation) -> bool:
         """Return True if a pose exists when nothing else is there."""
         if self.has_verified(held, target, relation):
@@ -226,7 +256,9 @@ class Placer:
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         return any(True for _ in candidates(one, other, relation, (0.5, 0.5), LIVE_TRIES))
 
-    def _takeable_first(self, search: PlacementSearch, poses: Iterator[Pose]) -> Iterator[Pose]:
+    def _takeable_first(
+        self, search: PlacementSearch | BesideSearch, poses: Iterator[Pose]
+    ) -> Iterator[Pose]:
         """Poses with a line of approach before a few others."""
         if self._navigator is None:
             yield from poses

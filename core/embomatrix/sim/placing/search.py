@@ -140,7 +140,7 @@ class PlacementSearch:
             if not len(options):
                 continue
             boxes = options.places.world_boxes(self.engine.joints(self.held), self._frames)
-            served = np.flatnonzero(self._served(boxes, self.robot)).tolist()
+            served = np.flatnonzero(self.serves(boxes, self.robot)).tolist()
             is_reached |= bool(boxes.reached_from(self.robot).any())
             is_served |= bool(served)
             for number in served[:EXAMINED]:
@@ -211,13 +211,13 @@ class PlacementSearch:
     ) -> Iterator[tuple[int, Corner]]:
         """Numbers and corners of the boxes in reach, handy ones first. ``rows`` receives the numbers as they are tested."""
         if self.excluded_stands:
-            reached = self._served(boxes, self.robot)
+            reached = self.serves(boxes, self.robot)
             for stand in self.excluded_stands:
-                reached &= ~self._served(boxes, stand)
+                reached &= ~self.serves(boxes, stand)
             served: Sequence[bool] = reached.tolist()
             order = [number for number in order if served[number]]
         elif self._rises_over_rim or any(self.engine.joints(self.target)):
-            served = self.served(known) if known is not None else self._served(boxes, self.robot).tolist()
+            served = self.served(known) if known is not None else self.serves(boxes, self.robot).tolist()
             order = [number for number in order if served[number]]
         corners = boxes.corners()
         reach, easy = Range.of(self.robot, *REACHED), Range.of(self.robot, *HANDY)
@@ -238,14 +238,14 @@ class PlacementSearch:
         memory = known.served
         found = memory.get(self.robot) if memory is not None else None
         if found is None:
-            found = tuple(self._served(known.boxes, self.robot).tolist())
+            found = tuple(self.serves(known.boxes, self.robot).tolist())
             if memory is not None:
                 if len(memory) >= STANDS_KEPT:
                     memory.clear()
                 memory[self.robot] = found
         return found
 
-    def _served(self, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
+    def serves(self, boxes: PoseBoxes, stand: StandPose) -> BoolArray:
         """Tell for each box, shape (n,), if the arm reaches it over the target's rim and past its open doors."""
         engine, asset, fractions = self.engine, self._asset(self.target), self.engine.joints(self.target)
         reached = boxes.reached_from(stand)

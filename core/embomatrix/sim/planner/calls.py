@@ -61,15 +61,9 @@ class PlanCalls:
             if call.skill is not Skill.MOVE or (following is not None and following.skill is not Skill.MOVE)
         )
 
-    def place(self, target: str, relation: PlaceRelation, near: str = "") -> Step:
-        """Place the held object, from beside ``near`` if possible.
-
-        If there is no free pose within reach, try from beside neighbours of the target too.
-        """
+    def place(self, target: str, relation: PlaceRelation) -> Step:
+        """Place the held object. If there is no free pose within reach, try from beside neighbours of the target too."""
         call = self._call(Skill.PLACE, target, relation)
-        found = self._from_beside(near, call, target) if near else None
-        if found is not None and found.ok:
-            return found
         step = self.use(Skill.PLACE, target, relation)
         if step.failure in NO_PLACE:
             for other in self._neighbours(target):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -35,14 +35,11 @@ PROOF_SEEDS: Final = (0, 1, 2)
 SOURCES_TRIED: Final = 3
 """Heat or cold sources, or tools, to try for an object."""
 VARIANTS_TRIED: Final = 4
-UNAIMED_VARIANTS_TRIED: Final = 8
-"""Variants to try for a relation, and for the relation that no skill aims at."""
+"""Variants to try for a relation."""
 ATTEMPTS: Final = 36
 """Most plans that are written for a task."""
 ROUNDS: Final = 4
 """Most times that one attempt looks for missing literals and acts on them."""
-UNAIMED: Final = Relation.NEXTTO
-"""Relation that no skill aims at: it comes about by luck, unless two objects share a small surface."""
 NAMED: Final = 2
 NAMED_IN_ROOM: Final = 3
 """Preference of an object whose category the instruction names, and of one that it names with the right room."""
@@ -60,13 +57,15 @@ class Strategy:
     """Parameters of one attempt.
 
     ``source_rank`` selects among sources and tools, ``variant`` among the ways to bring relations about. ``reverse`` turns the
-    order of the placements. ``singly`` lets a source work on one object at a time. ``seed`` decides about poses while the
-    plan is written. ``thrifty`` leaves out moves to objects in reach.
+    order of the placements. ``packed`` fills containers before they are carried to their places. ``singly`` lets a source work
+    on one object at a time. ``seed`` decides about poses while the plan is written. ``thrifty`` leaves out moves to objects in
+    reach.
     """
 
     source_rank: int = 0
     reverse: bool = False
     variant: int = 0
+    packed: bool = False
     singly: bool = False
     seed: int = PROOF_SEEDS[0]
     thrifty: bool = False
@@ -131,11 +130,22 @@ def _strategies(choice: Choice) -> list[Strategy]:
     found = itertools.product(
         PROOF_SEEDS,
         (False, True) if warm else (False,),
-        range(UNAIMED_VARIANTS_TRIED if UNAIMED in predicates else VARIANTS_TRIED if carried else 1),
+        range(VARIANTS_TRIED if carried else 1),
         range(SOURCES_TRIED) if choosy else (0,),
         (False, True) if carried > 1 else (False,),
+        (False, True) if _is_nested(choice) else (False,),
     )
-    return [Strategy(rank, reverse, variant, singly, seed) for seed, singly, variant, rank, reverse in found]
+    return [
+        Strategy(rank, reverse, variant, packed, singly, seed)
+        for seed, singly, variant, rank, reverse, packed in found
+    ]
+
+
+def _is_nested(choice: Choice) -> bool:
+    """True if something goes into a container that goes somewhere itself."""
+    placed = [_relation_of(item) for item in choice if item.positive and _is_relation(item)]
+    names = {item.name for item in placed}
+    return any(item.relation is Relation.INSIDE and item.target in names for item in placed)
 
 
 def _flaw(simulator: Simulator, task: Task, plan: Plan, choice: Choice) -> str:
@@ -145,11 +155,7 @@ def _flaw(simulator: Simulator, task: Task, plan: Plan, choice: Choice) -> str:
         if trace.failure is not None:
             return f"with seed {seed}, step {len(trace.steps)} of the plan fails: {trace.steps[-1].message}"
         if not evaluate(task.goal, simulator.facts, task.types):
-            missing = _missing(simulator, choice)
-            lucky = next((item for item in missing if item.atom.predicate == UNAIMED), None)
-            if lucky is not None:
-                return f"{_in_words(lucky)} depends on luck: no skill aims at it"
-            unmet = " ".join(map(_in_words, missing))
+            unmet = " ".join(map(_in_words, _missing(simulator, choice)))
             return f"with seed {seed} the plan runs to its end and the goal does not hold: {unmet} is missing"
     return ""
 
@@ -209,17 +215,41 @@ def _in_words(item: GroundLiteral) -> str:
 
 
 def _placements(choice: Choice, strategy: Strategy) -> tuple[PlacementGoal, ...]:
-    """Return final placements in an order that places the hosts of other objects first."""
+    """Return final placements in an order that places the hosts and neighbours of other objects first.
+
+    Packed containers are filled first instead, the innermost ones before the others.
+    """
     wanted = [_relation_of(item) for item in choice if item.positive and _is_relation(item)]
     if strategy.reverse:
         wanted.reverse()
+    implied = {item for item in wanted if _is_implied(item, wanted)}
     ordered: list[PlacementGoal] = []
     while wanted:
         moving = {item.name for item in wanted}
-        ready = next((item for item in wanted if item.target not in moving), wanted[0])
+        filled = {item.target for item in wanted if item.relation is Relation.INSIDE}
+        if strategy.packed:
+            free = [item for item in wanted if item.name not in filled and _may_precede(item, moving)]
+        else:
+            free = [item for item in wanted if item.target not in moving]
+        ready = next((item for item in free if item not in implied), (free or wanted)[0])
         wanted.remove(ready)
         ordered.append(ready)
     return tuple(ordered)
+
+
+def _may_precede(item: PlacementGoal, moving: Set[str]) -> bool:
+    """True if the object may be placed before its target is: into a container, but not onto a plate."""
+    return item.relation is Relation.INSIDE or item.target not in moving
+
+
+def _is_implied(item: PlacementGoal, wanted: Sequence[PlacementGoal]) -> bool:
+    """True if the object gets there when it is put next to another one that belongs there too."""
+    return any(
+        other.name == item.name
+        and other.relation is Relation.NEXTTO
+        and PlacementGoal(other.target, item.relation, item.target) in wanted
+        for other in wanted
+    )
 
 
 def _exposures(

@@ -47,15 +47,15 @@ class PlanScript:
         """Calls so far, as `PlanCalls.plan` gives them."""
         return self._calls.plan
 
-    def transfer(self, name: str, target: str, relation: PlaceRelation, *, near: str = "") -> None:
-        """Carry an object to its place, from beside ``near`` if possible. Containers are opened while the hand is empty.
+    def transfer(self, name: str, target: str, relation: PlaceRelation) -> None:
+        """Carry an object to its place. Containers are opened while the hand is empty.
 
         If there is no room, other portable objects at that place are put away first.
         """
         while True:
             self._prepare(target, relation)
             self._take(name, 0)
-            step = self._calls.place(target, relation, near)
+            step = self._calls.place(target, relation)
             if step.ok or (
                 step.failure is FailureReason.NO_FREE_POSE and self._place_on_contents(name, target, relation)
             ):

@@ -6,6 +6,7 @@ every object goes to its final place. Doors and switches get their final positio
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +18,6 @@ from embomatrix.sim.planner.script import PlanScript
 from embomatrix.sim.planner.tool_work import ToolMethod, ToolSubgoal, do_tool_work
 from embomatrix.skills.appliances import cold_source, heat_source
 from embomatrix.skills.syntax import PlaceRelation
-from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -45,12 +45,11 @@ class PlacementGoal:
 
 @dataclass(frozen=True, slots=True)
 class Carry:
-    """Place an object on, in or under a target. The robot stands at the object ``near``, if one is named."""
+    """Place an object on, in, under or next to a target."""
 
     name: str
     target: str
     relation: PlaceRelation
-    near: str = ""
 
 
 CarrySequence = tuple[Carry, ...]
@@ -141,7 +140,7 @@ class Subgoals:
         if not found:
             raise StuckError(f"{item.name} fits nowhere so that it is {item.relation.value} {item.target}")
         for carry in found[self.variant % len(found)]:
-            script.transfer(carry.name, carry.target, carry.relation, near=carry.near)
+            script.transfer(carry.name, carry.target, carry.relation)
 
     def _leave(self, script: PlanScript, world: LiveWorld) -> str:
         """End relations. Return the object that must stay in the hand because there is no room for it, else "".
@@ -185,8 +184,8 @@ def carry_sequences(
     """Return ways to bring a relation about, the surest first; none when the object fits nowhere.
 
     The requested relation comes first, then relations that imply it. An object is under another that is put on it, or when it
-    lies in an open cavity. An object is inside a container when it is on top of something in it. No skill aims at ``nextto``:
-    two objects on a small surface are often next to each other, as are objects placed from beside one another.
+    lies in an open cavity. An object is inside a container when it is on top of something in it. If there is no room next to an
+    object that can be carried, both go to another surface.
     """
     return tuple(dict.fromkeys(_carry_sequences(item, world, rows)))
 
@@ -214,51 +213,34 @@ def _carry_sequences(item: PlacementGoal, world: LiveWorld, rows: tuple[str, ...
             return
 
 
-def _placed(
-    item: PlacementGoal, world: LiveWorld, *relations: PlaceRelation, near: str = ""
-) -> Iterator[CarrySequence]:
+def _placed(item: PlacementGoal, world: LiveWorld, *relations: PlaceRelation) -> Iterator[CarrySequence]:
     for relation in relations:
         if _fits(world, item.name, item.target, relation):
-            yield (Carry(item.name, item.target, relation, near),)
+            yield (Carry(item.name, item.target, relation),)
 
 
 def _beside(item: PlacementGoal, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[CarrySequence]:
-    """Yield placements on the host of either object, then of both on any object of the table, small surfaces first."""
-    pair = (item.name, item.target)
+    """Yield placements of either object next to the other, then next to it on another surface, large surfaces first."""
     for mover in (item, item.inverse):
-        for host, relation in _hosts(mover.target, world, rows):
-            if host not in pair:
-                goal = PlacementGoal(mover.name, Relation.ONTOP, host)
-                yield from _placed(goal, world, relation, near=mover.target)
-    surfaces = [name for name in rows if name not in pair and world.asset(name).supports]
-    for host_name in sorted(surfaces, key=lambda name: _least_area_m2(world, name)):
-        placed = [
-            next(_placed(PlacementGoal(name, Relation.ONTOP, host_name), world, *ON_OR_IN), ())
-            for name in pair
-            if not world.is_fixed(name)
-        ]
-        if placed and all(placed):
-            yield tuple(carry for sequence in placed for carry in sequence)
+        yield from _placed(mover, world, PlaceRelation.NEXTTO)
+    surfaces = [name for name in rows if name not in (item.name, item.target) and world.asset(name).supports]
+    for surface in sorted(surfaces, key=lambda name: -_area_m2(world, name)):
+        for mover in (item, item.inverse):
+            first = PlacementGoal(mover.target, Relation.ONTOP, surface)
+            for there in itertools.islice(_placed(first, world, *ON_OR_IN), 1):
+                for beside in _placed(mover, world, PlaceRelation.NEXTTO):
+                    yield (*there, *beside)
 
 
-def _hosts(name: str, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[tuple[str, PlaceRelation]]:
-    """Yield the host of an object with the relation to it, or the floors of its room that the table lists."""
-    host = world.relations.host_of(name)
-    if host is not None:
-        yield host.name, PlaceRelation(host.relation.value)
-        return
-    for floor in rows:
-        if world.asset(floor).category == FLOOR_CATEGORY and world.room_of(floor) == world.room_of(name):
-            yield floor, PlaceRelation.ONTOP
-
-
-def _least_area_m2(world: LiveWorld, name: str) -> float:
-    return min(math.prod(surface.size_m) for surface in world.asset(name).supports)
+def _area_m2(world: LiveWorld, name: str) -> float:
+    return max(math.prod(surface.size_m) for surface in world.asset(name).supports)
 
 
 def _fits(world: LiveWorld, name: str, target: str, relation: PlaceRelation) -> bool:
-    """True if the object is portable and, by geometry alone, has a pose in this relation to the target."""
+    """True if the object is portable and, by geometry alone, may have a pose in this relation to the target."""
     if world.is_fixed(name):
         return False
+    if relation is PlaceRelation.NEXTTO:
+        return True
     poses = candidates(world.asset(name), world.asset(target), Relation(relation.value), MIDDLE, CANDIDATES)
     return next(poses, None) is not None

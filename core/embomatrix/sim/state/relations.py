@@ -103,9 +103,7 @@ class Relations:
             return False
         if _over(box_a, box_b) or _over(box_b, box_a):
             return False
-        mean = (sum(box_a.size_m) + sum(box_b.size_m)) / 6
-        limit = min(max(mean * NEXT_SHARE, NEXT_MIN_M), NEXT_MAX_M)
-        return self._engine.gap(a, b, limit) is not None
+        return self._engine.gap(a, b, next_gap_m(box_a, box_b)) is not None
 
     def touching(self, a: str, b: str) -> bool:
         """Return True if two surfaces are 5 mm apart or less."""
@@ -203,6 +201,12 @@ class Relations:
     def _apart(self, a: str, b: str) -> bool:
         """Return True if both objects are in the world and differ."""
         return a != b and not self._engine.is_parked(a) and not self._engine.is_parked(b)
+
+
+def next_gap_m(a: Aabb, b: Aabb) -> float:
+    """Return the largest gap at which objects with these boxes are next to each other."""
+    mean = (sum(a.size_m) + sum(b.size_m)) / 6
+    return min(max(mean * NEXT_SHARE, NEXT_MIN_M), NEXT_MAX_M)
 
 
 def _over(a: Aabb, b: Aabb) -> bool:

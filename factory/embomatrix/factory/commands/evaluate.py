@@ -24,6 +24,7 @@ from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.readings import evaluate_readings, read_answers
 from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
 from embomatrix.factory.evaluate.scripts import evaluate_scripts
+from embomatrix.factory.evaluate.skills import evaluate_skills, needed_in_dataset
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -43,13 +44,13 @@ def evaluate(
     parts: Annotated[
         list[str],
         typer.Argument(
-            help="Parts: tasks, scripts, readings, scenes, looks, admission, lies, aesthetics; or a .json file of figures."
+            help="Parts: tasks, scripts, skills, readings, scenes, looks, admission, lies, aesthetics; or a .json file."
         ),
     ],
     dataset: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset for the parts tasks, scripts and admission. Default for tasks: draft tasks with both writers."
+            help="Dataset for tasks, scripts, skills, readings and admission. Default for tasks: draft tasks with both writers."
         ),
     ] = None,
     training: Annotated[
@@ -61,12 +62,14 @@ def evaluate(
         Path | None,
         typer.Option(help="JSON lines file with the paper's sample of tasks, for scenes and looks."),
     ] = None,
-    only: Annotated[int, typer.Option(min=1, help="Use only every n-th of the 140 tasks.")] = 1,
+    only: Annotated[
+        int, typer.Option(min=1, help="Use only every n-th of the 140 tasks, or of a dataset's for skills.")
+    ] = 1,
     outcomes: Annotated[
         Path | None,
         typer.Option(help="JSON lines file for the outcomes of scenes; an interrupted run resumes from it."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes and scripts.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes, scripts and skills.")] = 1,
     answers: Annotated[
         Path | None,
         typer.Option(help="JSON lines file with the answers of a reader of prompts, for readings."),
@@ -87,7 +90,7 @@ def evaluate(
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
     ] = None,
 ) -> None:
-    """Measure parts of the factory: tasks, scripts, answers of readers, layouts of fixed tasks, admission, lies, aesthetics.
+    """Measure parts of the factory: tasks, scripts, skills, answers of readers, layouts, admission, lies, aesthetics.
 
     A language model judges looks, and also tasks if one is given.
     """
@@ -102,6 +105,7 @@ def evaluate(
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
         "lies": evaluate_lies,
         "readings": lambda: _readings(_given(dataset, "--dataset FOLDER"), _given(answers, "--answers FILE")),
+        "skills": lambda: _skills(_given(dataset, "--dataset FOLDER"), only, jobs),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
     check_output(page)
@@ -200,6 +204,13 @@ async def _looks(judge: Judge, tasks: Sequence[SourceText], seed: int) -> Evalua
     async with judge as model:
         with counter("trials", len(tasks) * len(METHODS)) as count:
             return await evaluate_looks(model, tasks, METHODS, seed, count)
+
+
+def _skills(folder: Path, only: int, jobs: int) -> EvaluationFigures:
+    """Measure the share of a dataset's tasks that need each skill."""
+    records = Dataset.load(folder).records[::only]
+    with counter("tasks", len(records)) as count:
+        return evaluate_skills(folder, needed_in_dataset(folder, records, jobs, count))
 
 
 def _aesthetics(rooms: Path, seed: int, calibration: Path | None) -> EvaluationFigures:

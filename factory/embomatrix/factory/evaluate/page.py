@@ -36,6 +36,13 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "computed from CPU time for two dedicated cores. The time covers writing, layout, look-ahead and verification of all "
         "drafts, and the base scenes. *plain* is the writer without social simulation.",
     ),
+    "skills": (
+        "Needed skills",
+        "`embomatrix factory evaluate skills --dataset DATASET` executes the oracle's plan of each task again without the "
+        "calls of one skill. A task needs the skill if its goal is then missed. *skill_share_min* is the smallest share of "
+        "tasks that need a skill, among the skills that a goal can need; docs/skills.md lists the others. Rows with *place* "
+        "are about one relation.",
+    ),
     "imports": (
         "Imports",
         "`embomatrix factory import … --instantiate --json FILE`: a problem counts as imported if a base scene was built with "

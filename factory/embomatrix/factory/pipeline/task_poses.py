@@ -1,9 +1,9 @@
 """Pose cache of a task's scene: verified poses for objects that goals bring together, and standing poses for all rows.
 
-Other pairs are left to the executor's live search, which takes milliseconds at run time. No skill aims at ``nextto``,
-so the cache holds only suitable poses for pairs that a goal wants next to each other. The neighbour stays where it
-is, or both objects are carried to one host; then the neighbour has one pose there, and all poses of the other lie
-beside it.
+Other pairs are left to the executor's live search, which takes milliseconds at run time. For pairs that a goal wants
+next to each other the cache holds only suitable poses, so that a plan which only names their host reaches the goal too.
+The neighbour stays where it is, or both objects are carried to one host; then the neighbour has one pose there, and all
+poses of the other lie beside it.
 """
 
 import itertools

@@ -92,7 +92,9 @@ class PlanGrammar:
                 arguments = [*(_EXPECTS_OF[argument] for argument in signature), _Expects.CALL_END]
                 self._arguments[index[skill.value], : len(arguments)] = torch.tensor(arguments, device=device)
                 self._fixed[_Expects.SKILL, index[skill.value]] = True
-        self._fixed[_Expects.RELATION, [index[relation.value] for relation in PlaceRelation]] = True
+        # Vocabularies of older checkpoints lack later relations.
+        relations = [index[relation.value] for relation in PlaceRelation if relation.value in index]
+        self._fixed[_Expects.RELATION, relations] = True
         self._fixed[_Expects.QUANTITY, list(vocabulary.quantity_tokens)] = True
         self._fixed[_Expects.CALL_END, [self._break, END]] = True
 
