@@ -16,10 +16,16 @@ from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Llm, M
 from embomatrix.factory.commands.options import Seed
 from embomatrix.factory.commands.terminal import check_output, counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
-from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
+from embomatrix.factory.evaluate.aesthetics_fit import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.page import with_factory
-from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
+from embomatrix.factory.evaluate.scenes import (
+    LayoutMethod,
+    PoseSource,
+    evaluate_scenes,
+    fixed_tasks,
+    outcome_log,
+)
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -59,6 +65,13 @@ def evaluate(
         typer.Option(help="JSON lines file for the outcomes of scenes; an interrupted run resumes from it."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes.")] = 1,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="File with recorded answers of the language model that writes poses, for scenes and looks. Missing answers "
+            "are requested with --llm and appended. Default: SmolLM2-135M's answers for the fixed tasks."
+        ),
+    ] = None,
     rooms: Annotated[
         Path | None, typer.Option(help="Gzipped JSON file with hand-made rooms, for aesthetics.")
     ] = None,
@@ -80,10 +93,11 @@ def evaluate(
     A language model judges looks, and also tasks if one is given.
     """
     judge = partial(chat_model, llm, model, key, cassette)
+    writer = PoseSource(poses, llm, model, key) if poses is not None else PoseSource()
     measures: Mapping[str, Callable[[], EvaluationFigures]] = {
         "tasks": lambda: _tasks(dataset, each, seed, judge() if llm or cassette else None),
-        "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes),
-        "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed)),
+        "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes, writer),
+        "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed, writer)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
@@ -156,28 +170,35 @@ async def _judged(judge: Judge, groups: Mapping[str, Sequence[DraftFeatures]], s
 
 
 def _scenes(
-    tasks: Sequence[SourceText], only: int, seed: int, jobs: int, outcomes: Path | None
+    tasks: Sequence[SourceText],
+    only: int,
+    seed: int,
+    jobs: int,
+    outcomes: Path | None,
+    poses: PoseSource,
 ) -> EvaluationFigures:
     """Measure generation rate, verification pass rate and time, by layout tree and two baselines."""
     kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
     with user_errors(outcomes, kept):
         log = outcome_log(outcomes, seed)
         with counter("trials", len(tasks) * len(METHODS)) as count:
-            evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log)
+            evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log, poses)
     taken = {"taken": f"one in {only} of the fixed tasks"} if only > 1 else {}
     return replace(evaluation, conditions={**taken, **evaluation.conditions})
 
 
-async def _looks(judge: Judge, tasks: Sequence[SourceText], seed: int) -> EvaluationFigures:
+async def _looks(
+    judge: Judge, tasks: Sequence[SourceText], seed: int, poses: PoseSource
+) -> EvaluationFigures:
     """Score layouts with the paper's judge: a vision-language model sees each room's plan and its layout tree."""
     async with judge as model:
         with counter("trials", len(tasks) * len(METHODS)) as count:
-            return await evaluate_looks(model, tasks, METHODS, seed, count)
+            return await evaluate_looks(model, tasks, METHODS, seed, count, poses)
 
 
 def _aesthetics(rooms: Path, seed: int, calibration: Path | None) -> EvaluationFigures:
-    """Measure how well the geometric score separates held-out hand-made rooms from corrupted ones."""
+    """Measure how well the score separates hand-made rooms outside the fit from corrupted copies of them."""
     evaluation, fitted = evaluate_aesthetics(rooms, seed)
     if calibration is not None:
-        write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
+        write_whole(calibration, (json.dumps(asdict(fitted)) + "\n").encode("ascii"))
     return evaluation
