@@ -13,16 +13,21 @@ from embomatrix.factory.evaluate.scenes import (
     LIST,
     LayoutMethod,
     LayoutOutcome,
+    PoseSource,
+    RecordedMethod,
     evaluate_scenes,
     evaluation_of,
     fixed_tasks,
+    interval_of_mean,
     outcome_log,
 )
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.metrics.figures import EvaluationError
+from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import SceneEditor
-from embomatrix.factory.task_import.sources import SourceText
+from embomatrix.factory.task_import.sources import SourceText, read_activity
+from embomatrix.factory.task_import.task import ImportOptions, import_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError
 from embomatrix.world.geometry import Pose
@@ -170,3 +175,19 @@ def test_outcomes_of_another_seed_are_rejected(tmp_path: "Path", content: str, m
     with pytest.raises(DatasetError, match=message):
         outcome_log(path, 0)
     assert path.read_text(encoding="utf-8") == content
+
+
+def test_packaged_recording_has_every_pose_of_a_fixed_task() -> None:
+    text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
+    scene = dict(json.loads(text)["behavior"])["store_firewood"]
+    with PoseSource().methods() as methods:
+        laid = RecordedMethod(methods[LayoutMethod.POSES])
+        task = read_activity("store_firewood")
+        import_problem(task, build_base_scene(scene), seed=0, options=ImportOptions(lay=laid))
+    assert laid.unwritten == 0
+    assert len(laid.names) >= 3
+
+
+def test_interval_of_a_mean_holds_it_and_narrows_with_more_scores() -> None:
+    few, many = interval_of_mean([6.0, 8.0] * 5), interval_of_mean([6.0, 8.0] * 50)
+    assert few[0] < many[0] < 7.0 < many[1] < few[1]

@@ -1,6 +1,7 @@
 """Layout levels one by one: room distribution, layout trees and object poses; then complete layouts in one flat."""
 
 import json
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ from tests.fakes.chat_server import ChatServer
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import wall_height_m
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName, BriefError
-from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
+from embomatrix.factory.layout.baselines import PoseWriter, lay_at_random
 from embomatrix.factory.layout.distribution import DistributionError, distribute
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.hanging import Hanger
@@ -32,7 +33,7 @@ from embomatrix.factory.scenes.check import check_scene
 from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
-from embomatrix.llm.values import EndpointError
+from embomatrix.llm.values import ChatRequest, EndpointError, Reply, Usage
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.catalog import Catalog
 
@@ -158,13 +159,55 @@ def test_unplaceable_object_is_reported_and_others_are_placed(flat: "Scene") -> 
     assert "mug" in layout.names
 
 
-@pytest.mark.parametrize("method", [lay_at_random, lay_by_poses])
-def test_baseline_methods_accept_the_same_items(flat: "Scene", method) -> None:
-    editor = SceneEditor(flat)
-    layout = method(editor, items(flat), 0)
+def test_random_layout_accounts_for_every_item(flat: "Scene") -> None:
+    layout = lay_at_random(SceneEditor(flat), items(flat), 0)
     assert layout.names.keys() | {failure.object_name for failure in layout.failures} == {
         each.name for each in items(flat)
     }
+
+
+class _Writer:
+    """Model that gives one text after the other and keeps the questions."""
+
+    def __init__(self, *texts: str) -> None:
+        self.texts = list(texts)
+        self.asked: list[ChatRequest] = []
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        self.asked.append(request)
+        return Reply(self.texts.pop(0), "writer-1", Usage(), "stop", 0.0)
+
+
+def test_written_poses_are_taken_as_they_are(flat: "Scene") -> None:
+    table = next(item.name for item in flat.objects if item.name.startswith("breakfast_table"))
+    mugs = [RequestedObject(f"mug.n.04_{number}", models("mug"), ON, table) for number in (1, 2)]
+    editor = SceneEditor(flat)
+    writer = _Writer("[50, 50, 90]", "Here: [100, 50.5, 0]")
+    with PoseWriter(writer) as poses:
+        layout = poses.lay(editor, mugs, 0)
+    box = editor.box_of(table)
+    first, second = (editor.objects[layout.names[each.name]].pose_world_asset for each in mugs)
+    assert first.position_m[:2] == pytest.approx(box.center_m[:2])
+    assert first.yaw == pytest.approx(math.pi / 2)
+    assert second.position_m[0] == pytest.approx(box.high_m[0])
+    asked = [message.text for message in writer.asked[1].messages[-3:]]
+    assert asked == ["mug on breakfast_table", "[50, 50, 90]", "mug on breakfast_table"]
+
+
+@pytest.mark.parametrize("answer", ["Sure! On the table.", "[1, 2]", "[5000, 0, 0]", '{"x": 1}'])
+def test_object_without_a_usable_pose_is_left_out(flat: "Scene", answer: str) -> None:
+    mugs = [RequestedObject(f"mug_{number}", models("mug")) for number in (1, 2)]
+    with PoseWriter(_Writer(answer, "[50, 50, 0]")) as poses:
+        layout = poses.lay(SceneEditor(flat), mugs, 0)
+    assert list(layout.names) == ["mug_2"]
+    assert [failure.reason for failure in layout.failures] == [LayoutReason.NO_POSE]
+
+
+def test_object_whose_host_has_no_place_is_left_out(flat: "Scene") -> None:
+    plate = RequestedObject("plate_1", models("plate"), ON, "table_1")
+    with PoseWriter(_Writer("[50, 50, 0]")) as poses:
+        (failure,) = poses.lay(SceneEditor(flat), [plate], 0).failures
+    assert failure.reason is LayoutReason.UNKNOWN_HOST
 
 
 @pytest.mark.parametrize("name", AgentName)

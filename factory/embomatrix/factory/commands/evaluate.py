@@ -16,13 +16,19 @@ from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Llm, M
 from embomatrix.factory.commands.options import Seed
 from embomatrix.factory.commands.terminal import check_output, counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
-from embomatrix.factory.evaluate.aesthetics import evaluate_aesthetics
+from embomatrix.factory.evaluate.aesthetics_fit import evaluate_aesthetics
 from embomatrix.factory.evaluate.density import density_figures, homes
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.lies import evaluate_lies
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.readings import evaluate_readings, read_answers
-from embomatrix.factory.evaluate.scenes import LayoutMethod, evaluate_scenes, fixed_tasks, outcome_log
+from embomatrix.factory.evaluate.scenes import (
+    LayoutMethod,
+    PoseSource,
+    evaluate_scenes,
+    fixed_tasks,
+    outcome_log,
+)
 from embomatrix.factory.evaluate.scripts import evaluate_scripts
 from embomatrix.factory.evaluate.skills import evaluate_skills, needed_in_dataset
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
@@ -74,6 +80,13 @@ def evaluate(
         Path | None,
         typer.Option(help="JSON lines file with the answers of a reader of prompts, for readings."),
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="File with recorded answers of the language model that writes poses, for scenes and looks. Missing answers "
+            "are requested with --llm and appended. Default: SmolLM2-135M's answers for the fixed tasks."
+        ),
+    ] = None,
     rooms: Annotated[
         Path | None, typer.Option(help="Gzipped JSON file with hand-made rooms, for aesthetics.")
     ] = None,
@@ -95,13 +108,14 @@ def evaluate(
     A language model judges looks, and also tasks if one is given.
     """
     judge = partial(chat_model, llm, model, key, cassette)
+    writer = PoseSource(poses, llm, model, key) if poses is not None else PoseSource()
     measures: Mapping[str, Callable[[], EvaluationFigures]] = {
         "tasks": lambda: _tasks(dataset, each, seed, judge() if llm or cassette else None),
         "scripts": lambda: evaluate_scripts(
             _given(dataset, "--dataset FOLDER"), training, jobs=jobs, counter=counter
         ),
-        "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes),
-        "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed)),
+        "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes, writer),
+        "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed, writer)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
         "lies": evaluate_lies,
         "readings": lambda: _readings(_given(dataset, "--dataset FOLDER"), _given(answers, "--answers FILE")),
@@ -186,24 +200,31 @@ async def _judged(judge: Judge, groups: Mapping[str, Sequence[DraftFeatures]], s
 
 
 def _scenes(
-    tasks: Sequence[SourceText], only: int, seed: int, jobs: int, outcomes: Path | None
+    tasks: Sequence[SourceText],
+    only: int,
+    seed: int,
+    jobs: int,
+    outcomes: Path | None,
+    poses: PoseSource,
 ) -> EvaluationFigures:
     """Measure generation rate, verification pass rate and time by three methods, and the density of base scenes."""
     kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
     with user_errors(outcomes, kept):
         log = outcome_log(outcomes, seed)
         with counter("trials", len(tasks) * len(METHODS)) as count:
-            evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log)
+            evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log, poses)
     taken = {"taken": f"one in {only} of the fixed tasks"} if only > 1 else {}
     figures = (*evaluation.figures, *density_figures(homes()[::only], seed))
     return replace(evaluation, figures=figures, conditions={**taken, **evaluation.conditions})
 
 
-async def _looks(judge: Judge, tasks: Sequence[SourceText], seed: int) -> EvaluationFigures:
+async def _looks(
+    judge: Judge, tasks: Sequence[SourceText], seed: int, poses: PoseSource
+) -> EvaluationFigures:
     """Score layouts with the paper's judge: a vision-language model sees each room's plan and its layout tree."""
     async with judge as model:
         with counter("trials", len(tasks) * len(METHODS)) as count:
-            return await evaluate_looks(model, tasks, METHODS, seed, count)
+            return await evaluate_looks(model, tasks, METHODS, seed, count, poses)
 
 
 def _skills(folder: Path, only: int, jobs: int) -> EvaluationFigures:
@@ -214,8 +235,8 @@ def _skills(folder: Path, only: int, jobs: int) -> EvaluationFigures:
 
 
 def _aesthetics(rooms: Path, seed: int, calibration: Path | None) -> EvaluationFigures:
-    """Measure how well the geometric score separates held-out hand-made rooms from corrupted ones."""
+    """Measure how well the score separates hand-made rooms outside the fit from corrupted copies of them."""
     evaluation, fitted = evaluate_aesthetics(rooms, seed)
     if calibration is not None:
-        write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
+        write_whole(calibration, (json.dumps(asdict(fitted)) + "\n").encode("ascii"))
     return evaluation

@@ -18,7 +18,7 @@ from embomatrix.factory.commands.language_model import (
     model_backed_agents,
 )
 from embomatrix.factory.commands.terminal import fail, say, user_errors
-from embomatrix.factory.evaluate.scenes import METHODS, LayoutMethod
+from embomatrix.factory.evaluate.scenes import LayoutMethod, PoseSource
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName
 from embomatrix.factory.layout.generator import lay as lay_by_tree
 from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
@@ -50,7 +50,12 @@ def lay(
     names = model_backed_agents(forms)
     if (bddl is None) is (not activity):
         fail("expected exactly one of --bddl FILE and --activity NAME")
-    with user_errors(more=MODEL_ERRORS), layout_agents(names, llm, model, key, cassette) as agents:
+    poses = PoseSource(cassette, llm, model, key) if method is LayoutMethod.POSES else PoseSource()
+    with (
+        user_errors(more=MODEL_ERRORS),
+        layout_agents(names, llm, model, key, cassette) as agents,
+        poses.methods() as methods,
+    ):
         source = read_file(bddl) if bddl is not None else read_activity(activity)
         layouts: list[Layout] = []
 
@@ -58,7 +63,7 @@ def lay(
             if method is LayoutMethod.TREE:
                 layouts.append(lay_by_tree(editor, items, seed, agents))
             else:
-                layouts.append(METHODS[method](editor, items, seed))
+                layouts.append(methods[method](editor, items, seed))
             return layouts[-1]
 
         imported = import_problem(

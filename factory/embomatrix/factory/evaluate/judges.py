@@ -3,21 +3,22 @@
 The scores of different models, and those of the geometric score, are not comparable.
 """
 
+import asyncio
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from embomatrix.factory.evaluate.scenes import METHODS, LayoutMethod, RecordedMethod
+from embomatrix.factory.evaluate.scenes import PACKAGED_POSES, LayoutMethod, PoseSource, RecordedMethod
 from embomatrix.factory.layout.organization import tree_in
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, Lay, import_problem
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatModel, ChatRequest, Message, Speaker, UnusableReplyError
 from embomatrix.pages.figures import Better, Figure
@@ -139,15 +140,31 @@ async def evaluate_looks(
     methods: Sequence[LayoutMethod],
     seed: int,
     progress: Callable[[int], None] = lambda _done: None,
+    poses: PoseSource = PACKAGED_POSES,
 ) -> EvaluationFigures:
     """Return the mean points of each method's scenes, without executing them. Raises EndpointError if no endpoint answers."""
+    with poses.methods() as lays:
+        return await _evaluate_looks(
+            model, tasks, {method: lays[method] for method in methods}, seed, progress
+        )
+
+
+async def _evaluate_looks(
+    model: ChatModel,
+    tasks: Sequence[SourceText],
+    methods: Mapping[LayoutMethod, Lay],
+    seed: int,
+    progress: Callable[[int], None],
+) -> EvaluationFigures:
     points: defaultdict[LayoutMethod, list[float]] = defaultdict(list)
     unusable = 0
     for done, task in enumerate(tasks):
         base = build_base_scene(task.scene)
         for number, method in enumerate(methods):
-            laid = RecordedMethod(METHODS[method])
-            imported = import_problem(task, base, seed=seed, options=ImportOptions(lay=laid))
+            laid = RecordedMethod(methods[method])
+            options = ImportOptions(lay=laid)
+            # A thread, because the pose writer has an event loop of its own.
+            imported = await asyncio.to_thread(import_problem, task, base, seed=seed, options=options)
             if isinstance(imported, ImportedTask) and laid.names:
                 try:
                     impression = await impression_of(model, imported.scene, laid.names, seed)

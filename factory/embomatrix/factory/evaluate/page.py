@@ -73,10 +73,11 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     "aesthetics": (
         "Aesthetics",
-        "`embomatrix factory evaluate aesthetics` computes a geometric score of 0 to 10. Its weights are fitted to give "
-        "hand-made rooms high scores, and the same rooms with shifted, swapped or dropped furniture low scores. *auc* is the "
-        "probability that a hand-made room outside the fit scores above a spoilt one. The score is not on the scale of the "
-        "paper's judge.",
+        "`embomatrix factory evaluate aesthetics` computes a geometric score of 0 to 10 for the objects that are added to a "
+        "room. It is fitted to give hand-made rooms high scores, and the same rooms with shifted, swapped, dropped or "
+        "scattered objects low scores. *auc* is the probability that a hand-made room outside the fit scores above a spoilt "
+        "one, with all objects of the rooms as added ones. In *half added* a random half of them is added, spoilt and "
+        "scored. The score is not on the scale of the paper's judge.",
     ),
     "looks": (
         "Scenes, as a model sees them",
@@ -86,10 +87,11 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     "scenes": (
         "Scenes for tasks",
         "`embomatrix factory evaluate scenes` lays out the same tasks with three methods and checks each scene with code that "
-        "no method uses. *aesthetics* covers the tasks that a method laid out, *aesthetics_shared* the tasks that all methods "
-        "laid out. Simple methods fail in crowded rooms, which score low. The score is of whole rooms, most of which no "
-        "method changes. *objects_per_living_room* and its like are medians over the rooms of all homes among the base scenes; "
-        "background objects count.",
+        "no method uses. *poses* are those that a language model, SmolLM2-135M-Instruct, wrote for the task; *poses_written* "
+        "is the share of tasks for which it wrote a usable pose for every object. *aesthetics* is the score of the added "
+        "objects in the tasks that a method laid out, *aesthetics_shared* in the tasks that all methods laid out. "
+        "*objects_per_living_room* and its like are medians over the rooms of all homes among the base scenes; background "
+        "objects count.",
     ),
 }
 """Heading and explanation of each part, in the order of the page."""

@@ -13,8 +13,8 @@ import itertools
 import json
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from importlib import resources
@@ -34,17 +34,19 @@ from embomatrix.factory.evaluate.furnishing import (
 from embomatrix.factory.evaluate.manipulation import out_of_hand
 from embomatrix.factory.evaluate.room_plans import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
-from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
+from embomatrix.factory.layout.baselines import PoseWriter, lay_at_random
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.request import Layout, RequestedObject
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.editor import SceneEditor
+from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity, read_jsonl
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, Lay, import_problem
+from embomatrix.llm.cassette import Cassette
+from embomatrix.llm.endpoint import Endpoint
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
@@ -54,6 +56,9 @@ from embomatrix.world.bundle import Bundle
 from embomatrix.world.scene import Scene
 
 LIST: Final = "scene_tasks.json"
+POSES: Final = "smollm2_poses.jsonl"
+RESAMPLES: Final = 1000
+"""Resamples of the bootstrap for the intervals of the mean aesthetics score."""
 
 
 class LayoutMethod(StrEnum):
@@ -64,18 +69,40 @@ class LayoutMethod(StrEnum):
     POSES = "poses"
 
 
-METHODS: Final[Mapping[LayoutMethod, Lay]] = {
-    LayoutMethod.TREE: lay,
-    LayoutMethod.RANDOM: lay_at_random,
-    LayoutMethod.POSES: lay_by_poses,
-}
+@dataclass(frozen=True, slots=True)
+class PoseSource:
+    """Language model that writes the poses of `LayoutMethod.POSES`: a recording, to which an endpoint adds what it lacks.
+
+    The default is the packaged recording of SmolLM2-135M-Instruct for the fixed tasks; NOTICE.md describes it.
+    """
+
+    recording: Path | None = None
+    url: str = ""
+    model: str = ""
+    key: str = field(default="", repr=False)
+
+    @contextlib.contextmanager
+    def methods(self) -> Iterator[Mapping[LayoutMethod, Lay]]:
+        """Yield all layout methods. Raises EndpointError or CassetteError."""
+        packaged = resources.as_file(resources.files("embomatrix.factory.evaluate") / POSES)
+        endpoint = Endpoint(self.url, self.model, api_key=self.key) if self.url else None
+        with packaged as path, PoseWriter(Cassette(self.recording or path, endpoint), endpoint) as writer:
+            yield {
+                LayoutMethod.TREE: lay,
+                LayoutMethod.RANDOM: lay_at_random,
+                LayoutMethod.POSES: writer.lay,
+            }
+
+
+PACKAGED_POSES: Final = PoseSource()
 
 
 @dataclass(frozen=True, slots=True)
 class LayoutOutcome:
     """Outcome of one task with one method; ``solved`` means that the oracle's plan reaches the goal.
 
-    ``scene_s`` and ``planar_s`` are CPU seconds, the latter by room.
+    ``scene_s`` and ``planar_s`` are CPU seconds, the latter by room. ``unwritten`` counts objects for which a language model
+    wrote no usable pose.
     """
 
     task: str
@@ -89,6 +116,7 @@ class LayoutOutcome:
     planar_s: tuple[float, ...]
     aesthetics: float | None
     detail: str = ""
+    unwritten: int = 0
 
 
 def fixed_tasks(sample: Path) -> list[SourceText]:
@@ -108,25 +136,33 @@ def fixed_tasks(sample: Path) -> list[SourceText]:
 
 
 class RecordedMethod:
-    """Layout method that records its planar solver's CPU seconds by room and the names of the objects it added."""
+    """Layout method that records its planar solver's CPU seconds by room, the objects it added, and unwritten poses."""
 
     def __init__(self, method: Lay) -> None:
         self._method = method
         self.names: tuple[str, ...] = ()
         self.planar_s: tuple[float, ...] = ()
+        self.unwritten = 0
 
     def __call__(self, editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
         layout = self._method(editor, items, seed)
         self.names = tuple(layout.names.values())
         self.planar_s = tuple(layout.record.planar_s.values())
+        self.unwritten = sum(failure.reason is LayoutReason.NO_POSE for failure in layout.failures)
         return layout
 
 
 def judge(
-    task: SourceText, method: LayoutMethod, base: Scene, library: PlacementLibrary, *, seed: int = 0
+    task: SourceText,
+    method: LayoutMethod,
+    base: Scene,
+    library: PlacementLibrary,
+    methods: Mapping[LayoutMethod, Lay],
+    *,
+    seed: int = 0,
 ) -> LayoutOutcome:
     """Lay a task out with a method, check the scene, and execute the oracle's plan in it."""
-    timed = RecordedMethod(METHODS[method])
+    timed = RecordedMethod(methods[method])
     began = time.process_time()
     imported = import_problem(task, base, seed=seed, options=ImportOptions(lay=timed))
     refused = LayoutOutcome(
@@ -140,10 +176,11 @@ def judge(
         scene_s=time.process_time() - began,
         planar_s=timed.planar_s,
         aesthetics=None,
+        unwritten=timed.unwritten,
     )
     if isinstance(imported, TaskRefusal):
         return replace(refused, reason=imported.reason.value, detail=imported.sentence)
-    refused = replace(refused, aesthetics=_beauty(imported))
+    refused = replace(refused, aesthetics=_beauty(imported, timed.names))
     refusal, lost = _executed(imported, library, seed)
     if refusal is not None and refusal.reason is RefusalReason.INIT_NOT_MET:
         return replace(refused, reason=refusal.reason.value, detail=refusal.sentence)
@@ -171,10 +208,13 @@ def _executed(
     return (verdict if isinstance(verdict, TaskRefusal) else None), lost
 
 
-def _beauty(imported: ImportedTask) -> float:
-    """Return the mean geometric score of the task's rooms."""
+def _beauty(imported: ImportedTask, added: Sequence[str]) -> float | None:
+    """Return the mean geometric score of the added objects in the task's rooms; None if nothing was added."""
     calibration = Calibration.load()
-    return float(np.mean([score_room(plan_of(imported.scene, r), calibration) for r in imported.rooms]))
+    rooms = dict.fromkeys(imported.scene.by_name[name].room for name in added)
+    scores = [score_room(plan_of(imported.scene, room, added), calibration) for room in rooms]
+    known = [score for score in scores if score is not None]
+    return float(np.mean(known)) if known else None
 
 
 def evaluation_of(
@@ -191,10 +231,14 @@ def evaluation_of(
     for method in LayoutMethod:
         mine = [outcome for outcome in outcomes if outcome.method is method]
         if mine:
-            figures += _figures(mine, method, _shared_scores(outcomes, method))
+            shared = _shared_scores(outcomes, method)
+            figures += _figures(mine, method, shared)
             reasons = Counter(outcome.reason for outcome in mine if outcome.reason)
             counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
             notes.append(f"Most common reasons for rejection, {method}: {counts}.")
+            if shared:
+                low, high = interval_of_mean(shared)
+                notes.append(f"95 % interval of aesthetics_shared, {method}: [{low:.2f}, {high:.2f}].")
     return EvaluationFigures("scenes", conditions, (*figures, *furnishing_figures(furnishing)), tuple(notes))
 
 
@@ -209,6 +253,14 @@ def _shared_scores(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> l
     return shared if len(measured) > 1 else []
 
 
+def interval_of_mean(scores: Sequence[float]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean by a bootstrap over tasks with a fixed seed."""
+    rng = np.random.default_rng(len(scores))
+    means = rng.choice(np.asarray(scores), (RESAMPLES, len(scores))).mean(axis=1)  # (resamples,)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
 def _figures(
     outcomes: Sequence[LayoutOutcome], method: LayoutMethod, shared: Sequence[float]
 ) -> Iterable[Figure]:
@@ -218,7 +270,9 @@ def _figures(
     planar_ms = [1000 * second for outcome in outcomes for second in outcome.planar_s]
     scores = [outcome.aesthetics for outcome in outcomes if outcome.aesthetics is not None]
     up, down = Better.HIGHER, Better.LOWER
+    written = [100.0 * (not each.unwritten) for each in outcomes if method is LayoutMethod.POSES]
     rows = (
+        ("poses_written", np.mean, written, "%", up, None),
         ("generation_rate", np.mean, [100.0 * each.generated for each in outcomes], "%", up, 95.0),
         ("verification_pass_rate", np.mean, [100.0 * each.verified for each in generated], "%", up, 99.0),
         ("oracle_solved_rate", np.mean, [100.0 * each.solved for each in generated], "%", up, None),
@@ -229,7 +283,7 @@ def _figures(
     )
     for name, average, values, unit, better, goal in rows:
         if values:
-            label = name if is_tree else f"{name} {method}"
+            label = name if is_tree or values is written else f"{name} {method}"
             value = float(average(values))
             yield Figure(label, value, unit, better, len(values), goal if is_tree else None)
 
@@ -256,6 +310,7 @@ def evaluate_scenes(
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
     log: ResumableLog[LayoutOutcome] | None = None,
+    poses: PoseSource = PACKAGED_POSES,
 ) -> tuple[EvaluationFigures, list[LayoutOutcome]]:
     """Run every task with every method and call ``progress`` with the number of finished trials.
 
@@ -272,7 +327,7 @@ def evaluate_scenes(
     died = EvaluationError(
         "a process that judges layouts died, possibly for lack of memory: run the same command with fewer --jobs"
     )
-    with shared_work(jobs, PlacementLibrary, partial(_judged, seed), died=died) as judge_all:
+    with shared_work(jobs, PlacementLibrary, partial(_judged, seed, poses), died=died) as judge_all:
         for outcome in itertools.chain.from_iterable(judge_all(by_scene.values())):
             log.add(outcome)
             progress(len(log.outcomes))
@@ -290,7 +345,10 @@ def evaluate_scenes(
     return evaluation_of(outcomes, conditions, total), outcomes
 
 
-def _judged(seed: int, library: PlacementLibrary, trials: Sequence[Trial]) -> list[LayoutOutcome]:
+def _judged(
+    seed: int, poses: PoseSource, library: PlacementLibrary, trials: Sequence[Trial]
+) -> list[LayoutOutcome]:
     """Return the outcomes of the trials in one base scene."""
     base = build_base_scene(trials[0][0].scene)
-    return [judge(task, method, base, library, seed=seed) for task, method in trials]
+    with poses.methods() as methods:
+        return [judge(task, method, base, library, methods, seed=seed) for task, method in trials]

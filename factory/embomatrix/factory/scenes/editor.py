@@ -37,6 +37,7 @@ class LayoutReason(StrEnum):
     UNKNOWN_HOST = "unknown_host"
     UNKNOWN_MODEL = "unknown_model"
     NO_HOST = "no_host"
+    NO_POSE = "no_pose"
     NO_SURFACE = "no_surface"
     TOO_LARGE = "too_large"
     NO_FREE_SPOT = "no_free_spot"
