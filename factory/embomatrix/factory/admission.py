@@ -46,6 +46,7 @@ class RefusalReason(StrEnum):
     ORACLE_FAILED = "oracle_failed"
     PHYSICS_FAILED = "physics_failed"
     SHORTCUT = "shortcut"
+    HIDDEN_OBSTACLE = "hidden_obstacle"
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from embomatrix.factory.social.day import NeedOfDay
 from embomatrix.factory.social.dialogue import converse, transcript_of
 from embomatrix.factory.social.telling import Asked, Teller, UndescribableError
 from embomatrix.factory.social.values import Cast, Conversation
-from embomatrix.factory.social.wish import Condition, Quantity, goal_of
+from embomatrix.factory.social.wish import Condition, Quantity, WishPredicate, goal_of
 from embomatrix.factory.task_import.reach import profile_for
 from embomatrix.factory.task_import.task_fields import signature_of, sources_for, taps_for
 from embomatrix.factory.writer.categories import category_of
@@ -96,7 +96,10 @@ class DraftWriter:
         task = task_of(task_id, self._view, conditions, members, about)
         while (unclear := self._unclear(task, members)) is not None:
             alike = self._alike(members[unclear])
-            if len(alike) == len(members[unclear]):
+            about_doors = any(
+                each.things == unclear and each.predicate is WishPredicate.OPEN for each in conditions
+            )
+            if len(alike) == len(members[unclear]) or about_doors:  # nobody wants just any cabinet closed
                 return None
             names = members[unclear]
             members = {label: alike if each == names else each for label, each in members.items()}

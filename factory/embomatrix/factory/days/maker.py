@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
+from embomatrix.factory.admission import SEED, RefusalReason, TaskRefusal, admit
 from embomatrix.factory.days.planning import PlanDay, PlannedDay, day_name, plan_day
 from embomatrix.factory.faithfulness.shortcuts import find_shortcuts, shortcut_in_words
 from embomatrix.factory.pipeline.build import Making
@@ -21,6 +21,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.writer.tasks import Draft
+from embomatrix.scripts.greedy import greedy_plan
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
@@ -28,13 +29,30 @@ from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import plan_to_json
+from embomatrix.skills.prompt import situation_of
 from embomatrix.skills.syntax import Plan
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.poses import PoseCache
 from embomatrix.world.scene import Scene
+
+SPATIAL: Final = frozenset(
+    {
+        FailureReason.NO_PATH,
+        FailureReason.NO_STANDING_POSE,
+        FailureReason.OUT_OF_REACH,
+        FailureReason.TOO_HIGH,
+        FailureReason.NO_LINE_OF_APPROACH,
+        FailureReason.DOOR_BLOCKED,
+        FailureReason.NO_FREE_POSE,
+        FailureReason.PLACES_OUT_OF_REACH,
+        FailureReason.PLACES_BEHIND_DOOR,
+    }
+)
+"""Failures for lack of space."""
 
 
 class DayMaker:
@@ -143,7 +161,20 @@ class _DayWork:
         found = find_shortcuts(simulator, draft.task, draft.intent, plan, self._settings.shortcut_plans)
         if found.shortcuts:
             return TaskRefusal(RefusalReason.SHORTCUT, shortcut_in_words(found, draft.task.table))
-        return plan
+        return self._hidden_obstacle(simulator, draft) or plan
+
+    def _hidden_obstacle(self, simulator: Simulator, draft: Draft) -> TaskRefusal | None:
+        """Return a refusal if the plain plan for the goal fails for lack of space, which no prompt shows.
+
+        A policy that understands the words must not fail because one of two orders of placing leaves no room.
+        """
+        task = draft.task
+        plan = greedy_plan(task, situation_of(simulator.world.scene, task))
+        trace = simulator.execute(task, plan, SEED)
+        if trace.failure not in SPATIAL:
+            return None
+        sentence = f"the plain plan for the goal fails, and no prompt shows why: {trace.steps[-1].message}"
+        return TaskRefusal(RefusalReason.HIDDEN_OBSTACLE, sentence)
 
     def _reject(self, category: str, instruction: str, goal: str, refusal: TaskRefusal) -> None:
         rejection = Rejection(

@@ -45,11 +45,13 @@ _NO_PASSIVE: Final = (
 """Beginnings of imperatives without a natural passive."""
 
 
-PLACED: Final = ("ontop", "inside", "under", "nextto")
+PLACED: Final = ("ontop", "inside", "inside bin", "under", "nextto")
 TAP: Final = " tap"
 """Ending of the keys of sinks, whose tap is turned on and off."""
 LONG_WORDS: Final = 3
 """Spaces in a noun phrase from which on a particle does not follow it."""
+_HAS_PLACE: Final = re.compile(r" (?:on|in|under|with) ")
+"""Prepositions in a noun phrase that tells a thing by its place."""
 _PARTICLE_FIRST: Final = re.compile(r"\w+ (?:on|off|up|down|out) \{x\}")
 """Verbs that no pronoun follows: *turn it on*, not *turn on it*."""
 _PARTICLE: Final = re.compile(r"\{x\} (?:up|down|off|on|open|shut|over|away|again|through)\b(?! \{y\})")
@@ -188,9 +190,13 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
             voice.choose(book.forms("done")), {**fields, "done": _filled(voice.choose(passives), fields)}
         )
     state = _filled(voice.choose(book.states(clause.key)), fields)
+    forms = book.forms(kind)
+    if _HAS_PLACE.search(clause.thing.words):
+        # *I want the milk in the fridge on the table* misleads; a verb must part thing and place.
+        forms = tuple(form for form in forms if "{x} {state}" not in form) or forms
     it = {**fields, "x": clause.thing.it}
     do_it = _filled(_verb(clause, book, voice), it)
-    return _written(voice.choose(book.forms(kind)), {**fields, "state": state, "do_it": do_it})
+    return _written(voice.choose(forms), {**fields, "state": state, "do_it": do_it})
 
 
 def imperative_of(clause: Clause, book: PhraseBook, voice: Voice) -> str:

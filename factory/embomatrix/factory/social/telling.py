@@ -49,6 +49,7 @@ AT_THE_END: Final = (
 )
 """Beginnings of sentences that take no joint."""
 LIGHTS: Final = frozenset({"table_lamp", "floor_lamp"})
+BINS: Final = ("trash_can", "_bin")
 TAPS: Final = ("_sink", "bathtub")
 _CHOICE: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _NAME: Final = re.compile(r"\{(\w+)\}")
@@ -105,15 +106,19 @@ class Teller:
             last = number == len(sentences) - 1
             kind = "first" if not number else "last" if last else "next"
             is_plain = len(sentences) > 1 and not sentence.startswith(AT_THE_END)
-            is_plain = is_plain and not sentence.endswith("too, please.")
+            is_plain = is_plain and not sentence.endswith(("too, please.", "?"))
             joint = self.voice.choose(self.book.joints(kind)) if is_plain else ""
             told.append(f"{joint}{_lowered(sentence, (name,))}" if joint else sentence)
         return " ".join(told)
 
     def _requests(self, asked: Asked, speaker: Speaker) -> list[str]:
-        if asked.need.need.say and self._rng() < IMPLIED_SHARE:
+        if asked.need.need.say and not self._leaves_choice(asked) and self._rng() < IMPLIED_SHARE:
             return [self._implied(asked, speaker)]
         return self._clauses(asked, speaker)
+
+    def _leaves_choice(self, asked: Asked) -> bool:
+        """True if a place may be any of several pieces of furniture, which sentences of needs don't provide for."""
+        return any(each.place and len(asked.members[each.place]) > 1 for each in asked.conditions)
 
     def _implied(self, asked: Asked, speaker: Speaker) -> str:
         text = self._personal(self.voice.choose(asked.need.need.say), asked.need, speaker)
@@ -223,14 +228,16 @@ class Teller:
             whence = self.describer.place_words(names[0])
         if whence and noun_of(self.describer.rows[self._host(names[0])].category).one in thing.words:
             whence = ""
-        return Clause(self._key(first, names), thing, place, whence, bare)
+        return Clause(self._key(first, names, members.get(first.place, ())), thing, place, whence, bare)
 
     def _host(self, name: str) -> str:
         return self.describer.rows[name].host
 
-    def _key(self, condition: Condition, names: Sequence[str]) -> str:
+    def _key(self, condition: Condition, names: Sequence[str], places: Sequence[str]) -> str:
         holds = condition.holds and condition.quantity is not Quantity.NONE
         key = condition.predicate.value if holds else f"not {condition.predicate.value}"
+        if key == "inside" and self.describer.rows[places[0]].category.endswith(BINS):
+            return "inside bin"
         if condition.predicate is WishPredicate.TOGGLED_ON:
             category = self.describer.rows[names[0]].category
             if category in LIGHTS:
