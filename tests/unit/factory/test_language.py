@@ -27,9 +27,9 @@ from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation
 
 KEYS = (
-    "ontop", "inside", "inside bin", "under", "nextto", "not ontop", "not inside", "open", "not open", "toggled_on", "not toggled_on",
-    "toggled_on light", "not toggled_on light", "toggled_on tap", "not toggled_on tap", "cooked", "hot", "frozen",
-    "not dusty", "not stained", "soaked", "sliced",
+    "ontop", "inside", "inside bin", "under", "nextto", "not ontop", "not inside", "open", "not open", "toggled_on",
+    "not toggled_on", "toggled_on light", "not toggled_on light", "toggled_on tap", "not toggled_on tap", "cooked", "hot",
+    "frozen", "not dusty", "not stained", "soaked", "sliced",
 )  # fmt: skip
 
 

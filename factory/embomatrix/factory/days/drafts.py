@@ -87,6 +87,11 @@ class DraftWriter:
         self._voice = voice
         self._book = PhraseBook(split, seed)
 
+    def trial(self, need: NeedOfDay, members: Members) -> Task:
+        """Return a need as a task of its own, without words, to test whether it can be met at all."""
+        conditions, own, about = self._joined(Combination((need,), (members,)))
+        return task_of(f"trial-{need.need.name}", self._view, conditions, own, about)
+
     def draft(self, task_id: str, combination: Combination) -> PlannedTask | None:
         """Return the draft of a task; None if its objects can't be told apart.
 
@@ -114,7 +119,7 @@ class DraftWriter:
         instruction, talk = told
         draft = Draft(
             task=replace(task, instruction=instruction),
-            about=task.table,
+            about=tuple(dict.fromkeys((*about, *appliances_for(self._view, task, about)))),
             rooms=tuple(sorted({self._view.room(name) for names in members.values() for name in names})),
             signature=signature_of(task.goal, self._view),
             intent=goal_clauses(task.goal, task.types),
@@ -191,8 +196,7 @@ def task_of(
     types = _types(view, conditions, members)
     goal = goal_of(conditions, members, types)
     used = {types[label]: members[label] for label in types if types[label] in types_of(goal)}
-    known = tuple(dict.fromkeys(name for names in members.values() for name in names))
-    needed = dict.fromkeys((*about, *sources_for(view, goal, used, known), *taps_for(view, goal, about)))
+    needed = dict.fromkeys((*about, *sources_for(view, goal, used, about), *taps_for(view, goal, about)))
     rng = np.random.default_rng(list(task_id.encode()))
     return Task(
         task_id=task_id,
@@ -206,6 +210,11 @@ def task_of(
         source=SOURCE,
         profile=profile_for(goal),
     )
+
+
+def appliances_for(view: SceneView, task: Task, about: Sequence[str]) -> tuple[str, ...]:
+    """Return appliances and taps that the goal needs besides the objects of the wishes."""
+    return (*sources_for(view, task.goal, task.types, about), *taps_for(view, task.goal, about))
 
 
 def _types(view: SceneView, conditions: Sequence[Condition], members: Members) -> dict[str, str]:

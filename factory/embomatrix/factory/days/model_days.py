@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
-from embomatrix.factory.days.drafts import Members, PlannedTask, task_of
+from embomatrix.factory.days.drafts import Members, PlannedTask, appliances_for, task_of
 from embomatrix.factory.days.laying import lay_out
 from embomatrix.factory.days.planning import PlannedDay, day_name
 from embomatrix.factory.language.nouns import noun_of
@@ -85,7 +85,7 @@ def planned_task(
             )
     draft = Draft(
         task=task,
-        about=task.table,
+        about=tuple(dict.fromkeys((*about, *appliances_for(view, task, about)))),
         rooms=tuple(sorted({view.room(name) for names in wanted.values() for name in names})),
         signature=signature_of(task.goal, view),
         intent=goal_clauses(task.goal, task.types),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -10,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from embomatrix.factory.admission import RefusalReason, TaskRefusal
+from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
 from embomatrix.factory.days.drafts import Combination, DayScene, DraftWriter, PlannedTask, combinations_of
 from embomatrix.factory.days.laying import lay_out
 from embomatrix.factory.language.kinds import is_held_out
@@ -23,12 +24,16 @@ from embomatrix.factory.social.knowledge import Need, events
 from embomatrix.factory.social.values import Cast
 from embomatrix.factory.writer.tasks import Draft
 from embomatrix.factory.writer.words import FreshVoice
+from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.simulation import load_simulator
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.poses import PoseCache
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
 
-NEEDS_OF_DAY: Final = 8
+NEEDS_OF_DAY: Final = 12
 """Maximum number of needs of one day."""
-NEEDS_OF_EVENT: Final = 3
+NEEDS_OF_EVENT: Final = 4
 HELD_OUT_SHAPES: Final = 5
 """One in this many goal shapes with several conditions belongs to the held-out split."""
 HELD_OUT_NEEDS: Final = 5
@@ -82,10 +87,10 @@ def plan_day(
     laid = lay_out(day_name(order), [need.wish for need in needs], base, rng, agents)
     if isinstance(laid, TaskRefusal):
         return laid
-    day = DayScene(laid.scene, tuple(needs[at] for at in laid.kept), laid.members)
-    writer = DraftWriter(day, cast, order.split, seed, FreshVoice(rng, Counter()))
+    laid_out = DayScene(laid.scene, tuple(needs[at] for at in laid.kept), laid.members)
+    writer = DraftWriter(laid_out, cast, order.split, seed, FreshVoice(rng, Counter()))
+    day, refusals = _met(laid_out, writer)
     tasks: list[PlannedTask] = []
-    refusals: list[TaskRefusal] = []
     known = set(order.known)
     for number, combination in enumerate(combinations_of(day, rng)):
         if order.split == "train" and is_held_out_shape(combination, seed):
@@ -99,6 +104,24 @@ def plan_day(
             known.add(key)
             tasks.append(planned)
     return PlannedDay(day.scene, tuple(tasks), tuple(refusals))
+
+
+def _met(day: DayScene, writer: DraftWriter) -> tuple[DayScene, list[TaskRefusal]]:
+    """Return the day with the needs that the oracle meets one by one, and refusals of the others.
+
+    A need that fails alone would take every task along that it is joined to.
+    """
+    kept: list[int] = []
+    refusals: list[TaskRefusal] = []
+    with contextlib.closing(load_simulator(Bundle(day.scene, {}, PoseCache()))) as simulator:
+        for number, (need, members) in enumerate(zip(day.needs, day.members, strict=True)):
+            verdict = admit(simulator, writer.trial(need, members), find_plan, most_held=1.0)
+            if isinstance(verdict, TaskRefusal):
+                refusals.append(TaskRefusal(verdict.reason, f"{need.need.name}: {verdict.sentence}"))
+            else:
+                kept.append(number)
+    left = DayScene(day.scene, tuple(day.needs[at] for at in kept), tuple(day.members[at] for at in kept))
+    return left, refusals
 
 
 def day_name(order: VariantOrder) -> str:

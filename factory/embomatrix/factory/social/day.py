@@ -23,8 +23,8 @@ from embomatrix.world.state import Relation, State
 
 MAX_MISSING: Final = 1
 """Maximum number of furniture pieces that a wish may demand without the scene having them."""
-NEVER_ADDED: Final = frozenset({"countertop", "bar", "commercial_kitchen_table"})
-"""Kinds of furniture that are not added to a room, since they are built into others."""
+NEVER_ADDED: Final = frozenset({"countertop", "bar", "commercial_kitchen_table", "microwave"})
+"""Kinds that are not added to a room: furniture built into other furniture, and appliances that stand on other furniture."""
 DECOY_SHARE: Final = 0.5
 OPEN_SHARE: Final = 0.2
 """Share of doors that stand open at the start."""
