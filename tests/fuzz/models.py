@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gzip
 import json
@@ -17,8 +18,11 @@ from tests.fuzz.world import record_line
 
 from embomatrix.factory.days.agent_interfaces import SOCIAL_AGENTS
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
+from embomatrix.factory.evaluate.difficulty import read_policy_shares
 from embomatrix.factory.evaluate.faithfulness import read_answers
 from embomatrix.factory.evaluate.judges import DiversityScores, Impression
+from embomatrix.factory.evaluate.readings import parse_goal
+from embomatrix.factory.evaluate.readings import read_answers as read_readings
 from embomatrix.factory.evaluate.room_plans import read_rooms
 from embomatrix.factory.evaluate.scenes import LayoutMethod, LayoutOutcome, outcome_log
 from embomatrix.factory.importers.convex import _kept as kept_pieces
@@ -44,6 +48,8 @@ from embomatrix.factory.metrics.figures import (
     read_evaluation,
 )
 from embomatrix.factory.pipeline.corpus import FROZEN_FILE, TRAIN, VERIFIED, check_frozen
+from embomatrix.factory.pipeline.export import merge_in_words
+from embomatrix.factory.pipeline.merge import MERGED_FILE
 from embomatrix.factory.pipeline.store import (
     ATTEMPTS_FILE,
     BUILD_FILE,
@@ -235,6 +241,22 @@ def _pieces(data: bytes) -> object:
 
 
 # Files of the factory
+
+
+def _readings(data: bytes) -> object:
+    answers = read_readings(in_file("answers.jsonl", data))
+    for each in answers:
+        with contextlib.suppress(EvaluationError):
+            parse_goal(each.goal, ("cup_1", "table_1"))
+    return answers
+
+
+def _shares(data: bytes) -> object:
+    return read_policy_shares(in_file("report.json", data))
+
+
+def _merged(data: bytes) -> object:
+    return merge_in_words(in_file(MERGED_FILE, data).parent)
 
 
 def _evaluation(data: bytes) -> object:
@@ -466,6 +488,27 @@ def table() -> dict[str, Decoder]:
             lambda: (layout,),
             frozenset({"factory.pipeline.store:_read_outcomes"}),
             mutate_json_lines,
+        ),
+        "answers of a reader": Decoder(
+            _readings,
+            (EvaluationError,),
+            lambda: (b'{"task": "t", "plan": "move 1", "goal": "(and (ontop 0 1) (exactly 1 (open 1)))"}',),
+            frozenset({"factory.evaluate.readings:read_answers"}),
+            mutate_json_lines,
+        ),
+        "report with verdicts": Decoder(
+            _shares,
+            (EvaluationError,),
+            lambda: (b'{"verdicts": [{"task": "t", "samples": [{"success": true}, {"lost": true}]}]}',),
+            frozenset({"factory.evaluate.difficulty:read_policy_shares"}),
+            mutate_json,
+        ),
+        "sources of a merge": Decoder(
+            _merged,
+            (DatasetError,),
+            lambda: (b'[{"name": "a", "tasks": 3, "digest": "sha256:0"}]',),
+            frozenset({"factory.pipeline.export:merge_in_words"}),
+            mutate_json,
         ),
         "frozen corpus": Decoder(
             _frozen,

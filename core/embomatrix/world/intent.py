@@ -9,8 +9,9 @@ from embomatrix.world.goal import Atom, Formula, Not, Quantified, Quantifier
 from embomatrix.world.state import THERMAL, Relation, State
 
 CLAUSE_PREDICATES: Final = frozenset(
-    {Relation.ONTOP, Relation.INSIDE, State.OPEN, State.TOGGLED_ON, *THERMAL}
-)
+    {Relation.ONTOP, Relation.INSIDE, Relation.UNDER, Relation.NEXTTO, State.OPEN, State.TOGGLED_ON, *THERMAL,
+     State.SLICED, State.SOAKED, State.DUSTY, State.STAINED}
+)  # fmt: skip
 """Predicates of clauses."""
 
 

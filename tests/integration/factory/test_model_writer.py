@@ -1,4 +1,4 @@
-"""Model writer: dialogues of several agents, bounded failures, and tasks about a variant's objects."""
+"""Model writer: dialogues of several agents, bounded failures, and scenes laid out for their requests."""
 
 import asyncio
 import json
@@ -10,21 +10,23 @@ from tests.fakes.chat_server import ChatServer
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.commands.app import _print_account
+from embomatrix.factory.days.laying import LaidOut, lay_out
+from embomatrix.factory.days.model_days import ModelDays, planned_task
+from embomatrix.factory.days.planning import PlannedDay
 from embomatrix.factory.evaluate.lies import LieTable, ScriptedModel, ScriptedRequest
-from embomatrix.factory.faithfulness.instruction import audit
+from embomatrix.factory.pipeline.variants import VariantOrder
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.model.agents import DAY, PEOPLE, SIGHT, SUMMARY, TURN, SocialModelAgents
-from embomatrix.factory.social.model.drafts import VariantModelWriter
 from embomatrix.factory.social.model.writer import ModelWriter
 from embomatrix.factory.social.scene_kinds import kinds_of
 from embomatrix.factory.social.wish import Condition, Wish, WishedObjects, WishPredicate
 from embomatrix.factory.social.written import WrittenRequest
-from embomatrix.factory.writer.tasks import Draft, DraftOrder
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.ledger import Ledger
 from embomatrix.llm.values import ChatRequest, EndpointError, Reply, UnusableReplyError, Usage
+from embomatrix.world.state import Relation
 from embomatrix.world.task import TaskCategory
 
 TABLE = LieTable.load()
@@ -268,59 +270,51 @@ VARIANT = build_variant(
 VIEW = SceneView(VARIANT.scene)
 
 
-def a_thing() -> tuple[str, str]:
-    """Return a small object whose kind is unique in the variant, and its room."""
-    kinds = [VIEW.category(name) for name in VARIANT.added]
-    name = next(
-        each
-        for each in VARIANT.added
-        if kinds.count(VIEW.category(each)) == 1
-        and VIEW.takes("bed_1", each, inside=False)
-        and VIEW.item(each).host
-    )
-    return VIEW.category(name), name
+def planned(*requests: ScriptedRequest) -> PlannedDay | TaskRefusal:
+    rooms = tuple(room.name for room in BASE.rooms)
+    order = VariantOrder("train", 0, BASE.base, rooms, dict.fromkeys(TaskCategory, 1), frozenset())
+    with ModelWriter(SocialModelAgents(ScriptedModel(TABLE.people, list(requests)))) as writer:
+        return ModelDays(writer).plan(order, BASE, 0)
 
 
-def draft(request: ScriptedRequest, category: TaskCategory) -> Draft | TaskRefusal | None:
-    with ModelWriter(SocialModelAgents(ScriptedModel(TABLE.people, [request]))) as writer:
-        order = DraftOrder(category, "t", np.random.default_rng(0))
-        return VariantModelWriter(writer).write(VARIANT, VIEW, order)
-
-
-def wish_for(kind: str, room: str) -> Wish:
+def wish_for(kind: str, count: int = 1) -> Wish:
     bed = WishedObjects(label="bed", kind="bed", room="bedroom_0", furniture=True)
-    thing = WishedObjects(label="thing", kind=kind, room=room)
+    table = WishedObjects(label="table", kind="coffee_table", room="living_room_0", furniture=True)
+    thing = WishedObjects(
+        label="thing", kind=kind, count=count, room="living_room_0", relation=Relation.ONTOP, host="table"
+    )
     return Wish(
-        objects=(bed, thing),
+        objects=(bed, table, thing),
         conditions=(Condition(predicate=WishPredicate.ONTOP, things="thing", place="bed"),),
     )
 
 
-def test_request_about_objects_of_a_variant_becomes_a_draft_of_the_goals_category() -> None:
-    kind, name = a_thing()
-    room = VIEW.room(name).rpartition("_")[0].replace("_", " ")
-    words = f"Please put the {kind.replace('_', ' ')} from the {room} on the bed."
-    request = ScriptedRequest("thing", "", words, wish_for(kind, VIEW.room(name)), None)
-    found = draft(request, TaskCategory.KITCHEN_OPERATION)
-    assert isinstance(found, Draft), found
-    assert found.task.goal_bddl == f"(ontop {name} bed_1)"
-    assert found.task.category is TaskCategory.PICK_AND_PLACE
-    assert {name, "bed_1"} <= set(found.task.table)
-    assert audit(found.task, found.intent, VIEW) == ()
-    assert words in found.transcript
+def test_a_thing_that_the_scene_lacks_is_laid_out_for_the_models_request() -> None:
+    words = "Please put the violin from the coffee table on the bed."
+    day = planned(ScriptedRequest("violin", "", words, wish_for("violin"), None))
+    assert isinstance(day, PlannedDay), day
+    (task,) = day.tasks
+    assert task.draft.task.goal_bddl == "(ontop violin_1 bed_1)"
+    assert task.draft.task.category is TaskCategory.PICK_AND_PLACE
+    assert {"violin_1", "bed_1"} <= set(task.draft.task.table)
+    assert task.draft.task.instruction == words
+    assert words in task.draft.transcript
+    assert day.scene.by_name["violin_1"].host.startswith("coffee_table")
 
 
-def test_request_about_objects_that_the_variant_lacks_is_refused() -> None:
-    request = ScriptedRequest(
-        "violin",
-        "",
-        "Please put the violin from the kitchen on the bed.",
-        wish_for("violin", "kitchen_0"),
-        None,
+def test_words_that_also_fit_another_object_of_the_scene_are_refused() -> None:
+    laid = lay_out("two", [wish_for("violin", 2)], BASE, np.random.default_rng(0))
+    assert isinstance(laid, LaidOut)
+    first, second = laid.members[0]["thing"]
+    request = next(each for each in written(scripted("book")) if isinstance(each, WrittenRequest))
+    request = request.model_copy(
+        update={"wish": wish_for("violin"), "instruction": "Put the violin on the bed."}
     )
-    found = draft(request, TaskCategory.PICK_AND_PLACE)
+    members = {**laid.members[0], "thing": (first,)}
+    found = planned_task("t", SceneView(laid.scene), request, {**members, "other": (second,)})
     assert isinstance(found, TaskRefusal)
-    assert found.reason is RefusalReason.NO_SCENE_OBJECT
+    assert found.reason is RefusalReason.UNFAITHFUL
+    assert second in found.sentence
 
 
 def test_build_summary_tells_calls_and_tokens_for_each_admitted_task(

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.admission import RefusalReason, plan_failure
 from embomatrix.factory.commands.app import app
+from embomatrix.factory.days.maker import DAYS
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.layout.organization import LayoutTree, organize
 from embomatrix.factory.layout.request import LayoutAgents
@@ -41,7 +42,7 @@ from embomatrix.world.intent import IntentClause
 from embomatrix.world.scene import Room, Scene
 from embomatrix.world.task import Task, TaskCategory
 
-TASKS_DIGEST = "be790361f87b9ff61007f6447ee2c97016e836c45cb8e2ed354c613e45301322"
+TASKS_DIGEST = "b7a659e75981901243066c44f18dee3db252eb3fb4921b6254419d30698e74ee"
 """SHA-256 of the task records of `SETTINGS` without the digests of their bundles."""
 QUICK = {"look_ahead": False, "physical": False}
 SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"), **QUICK)
@@ -356,12 +357,11 @@ def test_unknown_names_exit_with_2_and_one_sentence(
 
 def test_conversation_tasks_are_proved_in_physics_and_keep_transcripts(tmp_path):
     settings = BuildSettings(
-        train=4, heldout=0, seed=13, scenes=("Rs_int",), writer=WriterKind.SOCIAL, look_ahead=False
+        train=2, heldout=0, seed=13, scenes=("Pomaria_1_int",), writer=WriterKind.SOCIAL, look_ahead=False
     )
-    summary = build_dataset(tmp_path, settings)
+    summary = build_dataset(tmp_path, settings, making=DAYS)
     dataset = Dataset.load(tmp_path)
-    assert summary.total("train") == len(dataset.train) == 4
-    assert summary.rejected["physics_failed"] > 0, "with this seed, some plans fail in physics"
+    assert summary.total("train") == len(dataset.train) == 2
     for record in dataset.train:
         transcript = (tmp_path / "transcripts" / f"{record.task.task_id}.md").read_text(encoding="utf-8")
         assert transcript.startswith(f"# {record.task.instruction}\n")

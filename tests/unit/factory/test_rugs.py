@@ -95,7 +95,7 @@ def test_furniture_on_a_rug_still_counts_as_furniture_on_the_floor() -> None:
     scene = build_base_scene("house_double_floor_upper")
     lifted = [item for item in scene.objects if item.host.startswith("carpet_")]
     assert lifted
-    plan = plan_of(scene, lifted[0].room)
+    plan = plan_of(scene, lifted[0].room, ())
     kinds = {kind_of(scene.asset_of(item.name).category) for item in lifted}
     assert kinds <= {piece.kind for piece in plan.pieces}
     assert not kinds & {thing.kind for thing in plan.things}

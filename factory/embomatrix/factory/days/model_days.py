@@ -18,6 +18,7 @@ from embomatrix.factory.language.nouns import noun_of
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.variants import VariantOrder
 from embomatrix.factory.scenes.view import SceneView
+from embomatrix.factory.social.day import wanted_kinds
 from embomatrix.factory.social.model.writer import ModelWriter
 from embomatrix.factory.social.scene_kinds import kinds_of
 from embomatrix.factory.social.written import WrittenRequest
@@ -48,7 +49,7 @@ class ModelDays:
             kinds_of(SceneView(base)), REQUESTS_OF_DAY, int(rng.integers(SEEDS)), earlier
         )
         refusals = [each for each in written if isinstance(each, TaskRefusal)]
-        requests = [each for each in written if isinstance(each, WrittenRequest)]
+        requests = _of_different_things([each for each in written if isinstance(each, WrittenRequest)])
         if not requests:
             reason = TaskRefusal(
                 RefusalReason.UNUSABLE_ANSWER, "the model wrote no request that could be used"
@@ -66,6 +67,18 @@ class ModelDays:
             else:
                 tasks.append(found)
         return PlannedDay(laid.scene, tuple(tasks), tuple(refusals))
+
+
+def _of_different_things(requests: Sequence[WrittenRequest]) -> list[WrittenRequest]:
+    """Return the requests without those that ask for the same kinds of things as an earlier one of the day."""
+    kept: list[WrittenRequest] = []
+    asked: set[tuple[str, str]] = set()
+    for request in requests:
+        things = wanted_kinds(request.wish)
+        if not things & asked:
+            kept.append(request)
+            asked |= things
+    return kept
 
 
 def planned_task(

@@ -166,12 +166,12 @@ def _settings(folder: Path) -> str:
     try:
         settings = build_settings(folder)
     except DatasetError:
-        return _merged(folder) or "The folder holds no build settings: these tasks were imported."
+        return merge_in_words(folder) or "The folder holds no build settings: these tasks were imported."
     listed = ", ".join(f"{name} `{value}`" for name, value in settings.items() if name != "scenes")
     return f"`embomatrix factory`, settings: {listed}, {len(settings.get('scenes', ()))} scenes."
 
 
-def _merged(folder: Path) -> str:
+def merge_in_words(folder: Path) -> str:
     """Describe the sources of a merged dataset; empty for any other."""
     path = folder / MERGED_FILE
     if not path.is_file():

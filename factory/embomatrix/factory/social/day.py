@@ -313,10 +313,10 @@ class Agenda:
 
     def _repeats(self, asked: NeedOfDay) -> bool:
         """True if an earlier need wants something of the same furniture, or moves objects of the same kind."""
-        return any(bool(_wanted(other.wish) & _wanted(asked.wish)) for other in self.needs)
+        return any(bool(wanted_kinds(other.wish) & wanted_kinds(asked.wish)) for other in self.needs)
 
 
-def _wanted(wish: Wish) -> set[tuple[str, str]]:
+def wanted_kinds(wish: Wish) -> set[tuple[str, str]]:
     """Return the kinds of the objects that the conditions change, with their rooms."""
     groups = wish.groups
     things = (groups[condition.things] for condition in wish.conditions)
