@@ -103,6 +103,8 @@ class Teller:
         """Return the sentences with joints before some of them. ``name`` is the speaker's."""
         told = []
         for number, sentence in enumerate(sentences):
+            if name and number and sentence.startswith(f"{name} "):
+                sentence = f"{'She' if is_female(name) else 'He'}{sentence.removeprefix(name)}"
             last = number == len(sentences) - 1
             kind = "first" if not number else "last" if last else "next"
             is_plain = len(sentences) > 1 and not sentence.startswith(AT_THE_END)
