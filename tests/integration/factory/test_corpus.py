@@ -26,14 +26,19 @@ def kitchen(tmp_path_factory):
     return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen")))
 
 
-def _written(folder, kitchen, splits, scene, kinds):
-    """Return a dataset of kitchen tasks with the given scenes and signatures."""
+def _written(folder, kitchen, splits, scene, kinds, words="Request {kind} in {scene}."):
+    """Write a dataset of kitchen tasks with the given scene, signatures and words."""
     records = [
         dataclasses.replace(
             record,
             split=split,
             signature=kind,
-            task=dataclasses.replace(record.task, task_id=f"{scene}-{number}", scene_id=f"{scene}-x"),
+            task=dataclasses.replace(
+                record.task,
+                task_id=f"{scene}-{number}",
+                scene_id=f"{scene}-x",
+                instruction=words.format(kind=kind, scene=scene),
+            ),
         )
         for number, (record, split, kind) in enumerate(zip(kitchen.records, splits, kinds, strict=False))
     ]
@@ -75,9 +80,13 @@ def test_damaged_bundle_is_detected(corpus):
         check_frozen(corpus)
 
 
-def test_signature_on_both_sides_is_refused(corpus, kitchen):
-    _written(corpus / UNSEEN, kitchen, ("heldout", "heldout"), "Ihlen_1_int", "ae")
-    with pytest.raises(DatasetError, match="'a' are trained on and held out"):
+def test_a_goal_of_one_scene_on_both_sides_is_refused(corpus, kitchen):
+    _written(corpus / TRAIN, kitchen, ("train", "train", "heldout"), "Rs_int", "aba", "Request {kind} or so.")
+    with pytest.raises(DatasetError, match="'Request a or so.' is trained on and held out"):
+        freeze(corpus)
+    _written(corpus / UNSEEN, kitchen, ("heldout", "heldout"), "Rs_int", "ae")
+    _written(corpus / TRAIN, kitchen, ("train", "train", "train"), "Rs_int", "abc", "Ask for {kind}.")
+    with pytest.raises(DatasetError, match="'a' in Rs_int are trained on and held out"):
         freeze(corpus)
 
 

@@ -80,13 +80,19 @@ def read_answers(path: Path) -> tuple[Reading, ...]:
 
 
 def prompts_of(dataset: Dataset, count: int) -> str:
-    """Return the prompts of the first held-out tasks, without any goal, as text for a reader."""
+    """Return the prompts of the first held-out tasks, without any goal, as text for a reader.
+
+    The system text of a profile stands before the first of its tasks.
+    """
     parts: list[str] = []
+    shown: set[str] = set()
     for record in dataset.heldout[:count]:
         scene = dataset.bundle(record.bundle_digest).scene
         prompt = prompt_for(situation_of(scene, record.task), Codec.LINES)
-        system = prompt.system if not parts else ""
-        parts.append(f"{system}\n\n## {record.task.task_id}\n\n{prompt.user}\n".lstrip())
+        if prompt.system not in shown:
+            shown.add(prompt.system)
+            parts.append(f"{prompt.system}\n")
+        parts.append(f"## {record.task.task_id}\n\n{prompt.user}\n")
     return "\n".join(parts)
 
 
