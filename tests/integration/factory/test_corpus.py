@@ -82,7 +82,7 @@ def test_damaged_bundle_is_detected(corpus):
 
 def test_a_goal_of_one_scene_on_both_sides_is_refused(corpus, kitchen):
     _written(corpus / TRAIN, kitchen, ("train", "train", "heldout"), "Rs_int", "aba", "Request {kind} or so.")
-    with pytest.raises(DatasetError, match="'Request a or so.' is trained on and held out"):
+    with pytest.raises(DatasetError, match=r"'Request a or so\.' is trained on and held out"):
         freeze(corpus)
     _written(corpus / UNSEEN, kitchen, ("heldout", "heldout"), "Rs_int", "ae")
     _written(corpus / TRAIN, kitchen, ("train", "train", "train"), "Rs_int", "abc", "Ask for {kind}.")
