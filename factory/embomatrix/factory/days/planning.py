@@ -22,6 +22,7 @@ from embomatrix.factory.social.day import draw_needs
 from embomatrix.factory.social.household import draw_cast
 from embomatrix.factory.social.knowledge import Need, events
 from embomatrix.factory.social.values import Cast
+from embomatrix.factory.social.wish import WishPredicate
 from embomatrix.factory.writer.tasks import Draft
 from embomatrix.factory.writer.words import FreshVoice
 from embomatrix.sim.planner.oracle import find_plan
@@ -38,6 +39,17 @@ HELD_OUT_SHAPES: Final = 5
 """One in this many goal shapes with several conditions belongs to the held-out split."""
 HELD_OUT_NEEDS: Final = 5
 """One in this many needs belongs to the held-out split."""
+RARE: Final = frozenset(
+    {
+        WishPredicate.UNDER,
+        WishPredicate.NEXTTO,
+        WishPredicate.DUSTY,
+        WishPredicate.STAINED,
+        WishPredicate.SOAKED,
+    }
+)
+RARE_WEIGHT: Final = 4.0
+"""Weight of needs with a predicate that few needs have, so that each skill is needed by one task in twenty."""
 FAVOUR: Final = 3.0
 """Weight of needs whose category is missing most, or which belong to the held-out split, relative to others."""
 
@@ -137,7 +149,9 @@ def need_weights(split: str, seed: int, missing: Mapping[TaskCategory, int]) -> 
         for need in event.needs:
             held_out = is_held_out(need.name, seed, HELD_OUT_NEEDS)
             weight = 0.0 if held_out and split == "train" else FAVOUR if held_out else 1.0
-            weights[need.name] = weight * (FAVOUR if missing.get(_category(need), 0) == most > 0 else 1.0)
+            rare = any(part.predicate in RARE for part in need.goal)
+            scarce = missing.get(_category(need), 0) == most > 0
+            weights[need.name] = weight * (RARE_WEIGHT if rare else 1.0) * (FAVOUR if scarce else 1.0)
     return weights
 
 

@@ -90,7 +90,8 @@ class Teller:
             said[0] = (
                 f"{capitalised(self.voice.choose(first.event.before))}, {_lowered(said[0], (speaker.name,))}"
             )
-        return f"{greeting}{capitalised(why)} {self._joined(said, speaker.name)}"
+        text = f"{greeting}{capitalised(why)} {self._joined(said, speaker.name)}"
+        return text if first.person.name in text else f"{first.person.name} says: {text}"
 
     def reason(self, need: NeedOfDay) -> str:
         """Return a sentence about the event in the first person."""
