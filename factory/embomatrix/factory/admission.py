@@ -51,18 +51,19 @@ class RefusalReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TaskRefusal:
-    """Refused task: the reason, and a sentence about the case."""
+    """Refused task: the reason, and a sentence about the case. ``about`` is the problem's object at fault, if one is."""
 
     reason: RefusalReason
     sentence: str
+    about: str = ""
 
 
 class RefusedError(Exception):
     """Refusal raised inside a binding. Callers of the import get the refusal as a value."""
 
-    def __init__(self, reason: RefusalReason, sentence: str) -> None:
+    def __init__(self, reason: RefusalReason, sentence: str, about: str = "") -> None:
         super().__init__(sentence)
-        self.refusal = TaskRefusal(reason, sentence)
+        self.refusal = TaskRefusal(reason, sentence, about)
 
 
 SEED: Final = 0

@@ -21,7 +21,7 @@ from embomatrix.world.scene import Scene
 SOURCE: Final = "society"
 """Source of the tasks of a simulated society."""
 MAX_LAYOUTS: Final = 6
-"""Maximum number of layouts tried for a day. After each failure, one wish goes."""
+"""Maximum number of layouts tried for a day. After each failure, the wish whose object finds no place goes."""
 SEEDS: Final = 2**31
 
 
@@ -58,7 +58,17 @@ def lay_out(
             return LaidOut(imported.scene, tuple(kept), members, imported.notes)
         if len(kept) == 1 or len(kept) <= len(wishes) - MAX_LAYOUTS:
             return imported
-        del kept[int(rng.integers(len(kept)))]
+        del kept[_at_fault(imported, labels, rng)]
+
+
+def _at_fault(
+    refusal: TaskRefusal, labels: Sequence[Mapping[str, tuple[str, ...]]], rng: np.random.Generator
+) -> int:
+    """Return the position of the wish whose object finds no place; any position if the refusal names none."""
+    for number, group in enumerate(labels):
+        if any(refusal.about in names for names in group.values()):
+            return number
+    return int(rng.integers(len(labels)))
 
 
 def _found(group: Mapping[str, tuple[str, ...]], there: Mapping[str, str]) -> dict[str, tuple[str, ...]]:

@@ -241,6 +241,7 @@ class _Binder:
                 raise RefusedError(
                     RefusalReason.DOES_NOT_FIT,
                     f"{addition.name!r} has no place: its type has no model{abilities if addition.needs else ''}",
+                    addition.name,
                 )
         found = {name: editor.asset_of(there) for name, there in binding.found.items()}
         return with_sizes(orders, binding.additions, requirements, found, compact=self._options.compact)
@@ -379,6 +380,7 @@ def _misfit(wrong: LayoutFailure) -> RefusedError:
     return RefusedError(
         RefusalReason.DOES_NOT_FIT,
         f"{wrong.object_name!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
+        wrong.object_name,
     )
 
 
