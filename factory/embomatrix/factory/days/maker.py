@@ -35,6 +35,7 @@ from embomatrix.skills.prompt import situation_of
 from embomatrix.skills.syntax import Plan
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.goal import And
 from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.poses import PoseCache
 from embomatrix.world.scene import Scene
@@ -164,17 +165,21 @@ class _DayWork:
         return self._hidden_obstacle(simulator, draft) or plan
 
     def _hidden_obstacle(self, simulator: Simulator, draft: Draft) -> TaskRefusal | None:
-        """Return a refusal if the plain plan for the goal fails for lack of space, which no prompt shows.
+        """Return a refusal if a plain plan for the goal, in one order or the other, fails for lack of space.
 
         A policy that understands the words must not fail because one of two orders of placing leaves no room.
         """
         task = draft.task
-        plan = greedy_plan(task, situation_of(simulator.world.scene, task))
-        trace = simulator.execute(task, plan, SEED)
-        if trace.failure not in SPATIAL:
-            return None
-        sentence = f"the plain plan for the goal fails, and no prompt shows why: {trace.steps[-1].message}"
-        return TaskRefusal(RefusalReason.HIDDEN_OBSTACLE, sentence)
+        atoms = tuple(atom for atom, _ in task.goal_atoms)
+        for order in (atoms, atoms[::-1]):
+            plan = greedy_plan(replace(task, goal=And(order)), situation_of(simulator.world.scene, task))
+            trace = simulator.execute(task, plan, SEED)
+            if trace.failure in SPATIAL:
+                sentence = (
+                    f"a plain plan for the goal fails, and no prompt shows why: {trace.steps[-1].message}"
+                )
+                return TaskRefusal(RefusalReason.HIDDEN_OBSTACLE, sentence)
+        return None
 
     def _reject(self, category: str, instruction: str, goal: str, refusal: TaskRefusal) -> None:
         rejection = Rejection(

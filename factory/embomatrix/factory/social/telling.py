@@ -53,6 +53,8 @@ BINS: Final = ("trash_can", "_bin")
 TAPS: Final = ("_sink", "bathtub")
 _CHOICE: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _NAME: Final = re.compile(r"\{(\w+)\}")
+_INNER_PRONOUN: Final = re.compile(r"(?<=[\w,;:] )(?:He|She)\b")
+"""Pronoun of a speaker inside a sentence."""
 _GREETINGS: Final = ("{name} here. ", "This is {name}. ", "It's {name}. ", "Hello, {name} speaking. ")
 
 
@@ -91,6 +93,7 @@ class Teller:
                 f"{capitalised(self.voice.choose(first.event.before))}, {_lowered(said[0], (speaker.name,))}"
             )
         text = f"{greeting}{capitalised(why)} {self._joined(said, speaker.name)}"
+        text = _INNER_PRONOUN.sub(lambda match: match.group(0).lower(), text)
         return text if first.person.name in text else f"{first.person.name} says: {text}"
 
     def reason(self, need: NeedOfDay) -> str:
