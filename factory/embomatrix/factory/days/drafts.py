@@ -24,6 +24,7 @@ from embomatrix.factory.writer.tasks import Draft, object_table
 from embomatrix.factory.writer.words import FreshVoice
 from embomatrix.skills.prompt import situation_of
 from embomatrix.world.evaluate import render, types_of
+from embomatrix.world.goal import Formula
 from embomatrix.world.intent import goal_clauses
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
@@ -117,15 +118,9 @@ class DraftWriter:
         if told is None:
             return None
         instruction, talk = told
-        draft = Draft(
-            task=replace(task, instruction=instruction),
-            about=tuple(dict.fromkeys((*about, *appliances_for(self._view, task, about)))),
-            rooms=tuple(sorted({self._view.room(name) for names in members.values() for name in names})),
-            signature=signature_of(task.goal, self._view),
-            intent=goal_clauses(task.goal, task.types),
-            transcript=transcript_of(self._cast, combination.needs[0], talk, instruction, task.goal_bddl),
-        )
-        return PlannedTask(draft, talk)
+        transcript = transcript_of(self._cast, combination.needs[0], talk, instruction, task.goal_bddl)
+        told_task = replace(task, instruction=instruction)
+        return PlannedTask(draft_of(self._view, told_task, members, about, transcript), talk)
 
     def _joined(
         self, combination: Combination
@@ -196,7 +191,7 @@ def task_of(
     types = _types(view, conditions, members)
     goal = goal_of(conditions, members, types)
     used = {types[label]: members[label] for label in types if types[label] in types_of(goal)}
-    needed = dict.fromkeys((*about, *sources_for(view, goal, used, about), *taps_for(view, goal, about)))
+    needed = _needed(view, goal, used, about)
     rng = np.random.default_rng(list(task_id.encode()))
     return Task(
         task_id=task_id,
@@ -205,16 +200,29 @@ def task_of(
         category=category_of(goal),
         goal=goal,
         goal_bddl=render(goal),
-        table=object_table(view, tuple(needed), rng, elsewhere=True),
+        table=object_table(view, needed, rng, elsewhere=True),
         types=used,
         source=SOURCE,
         profile=profile_for(goal),
     )
 
 
-def appliances_for(view: SceneView, task: Task, about: Sequence[str]) -> tuple[str, ...]:
-    """Return appliances and taps that the goal needs besides the objects of the wishes."""
-    return (*sources_for(view, task.goal, task.types, about), *taps_for(view, task.goal, about))
+def draft_of(view: SceneView, task: Task, members: Members, about: Sequence[str], transcript: str) -> Draft:
+    """Return the draft of a task with its instruction. ``members`` are the objects of its conditions by label."""
+    return Draft(
+        task=task,
+        about=_needed(view, task.goal, task.types, about),
+        rooms=tuple(sorted({view.room(name) for names in members.values() for name in names})),
+        signature=signature_of(task.goal, view),
+        intent=goal_clauses(task.goal, task.types),
+        transcript=transcript,
+    )
+
+
+def _needed(view: SceneView, goal: Formula, types: Members, about: Sequence[str]) -> tuple[str, ...]:
+    """Return the objects of the wishes, with appliances and taps that the goal needs besides."""
+    others = (*sources_for(view, goal, types, about), *taps_for(view, goal, about))
+    return tuple(dict.fromkeys((*about, *others)))
 
 
 def _types(view: SceneView, conditions: Sequence[Condition], members: Members) -> dict[str, str]:

@@ -35,7 +35,6 @@ class LaidOut:
     scene: Scene
     kept: tuple[int, ...]
     members: tuple[Mapping[str, tuple[str, ...]], ...]
-    notes: tuple[str, ...] = ()
 
 
 def lay_out(
@@ -55,7 +54,7 @@ def lay_out(
         if not isinstance(imported, TaskRefusal):
             there = dict(zip(imported.instances, imported.about, strict=True))
             members = tuple(_found(group, there) for group in labels)
-            return LaidOut(imported.scene, tuple(kept), members, imported.notes)
+            return LaidOut(imported.scene, tuple(kept), members)
         if len(kept) == 1 or len(kept) <= len(wishes) - MAX_LAYOUTS:
             return imported
         del kept[_at_fault(imported, labels, rng)]

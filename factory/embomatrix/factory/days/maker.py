@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from embomatrix.factory.admission import SEED, RefusalReason, TaskRefusal, admit
+from embomatrix.factory.admission import SEED, RefusalReason, TaskRefusal
 from embomatrix.factory.days.planning import PlanDay, PlannedDay, day_name, plan_day
-from embomatrix.factory.faithfulness.shortcuts import find_shortcuts, shortcut_in_words
 from embomatrix.factory.pipeline.build import Making
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.store import Rejection, VariantResult, VariantYield
 from embomatrix.factory.pipeline.task_poses import PoseNeeds, SceneSurvey, cache_poses
-from embomatrix.factory.pipeline.variants import VariantOrder
+from embomatrix.factory.pipeline.variants import VariantOrder, prove, record_of
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.neighbours import neighbours_of
@@ -27,14 +25,11 @@ from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
-from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import situation_of
 from embomatrix.skills.syntax import Plan
 from embomatrix.world.bundle import Bundle, encode_bundle
-from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.goal import And
 from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.poses import PoseCache
@@ -89,7 +84,7 @@ DAYS: Final = Making(DayMaker, whole_scenes=True)
 
 def days_planned_by(plan: PlanDay) -> Making:
     """Return a making of days with another planner. Equal planners give equal days."""
-    return Making(partial(DayMaker, plan=plan), whole_scenes=True)
+    return replace(DAYS, begin=partial(DayMaker, plan=plan))
 
 
 class _DayWork:
@@ -156,12 +151,9 @@ class _DayWork:
         return True
 
     def _verdict(self, simulator: Simulator, physics: Simulator | None, draft: Draft) -> Plan | TaskRefusal:
-        plan = admit(simulator, draft.task, find_plan, physics=physics)
+        plan = prove(simulator, draft, self._settings.shortcut_plans, physics)
         if isinstance(plan, TaskRefusal):
             return plan
-        found = find_shortcuts(simulator, draft.task, draft.intent, plan, self._settings.shortcut_plans)
-        if found.shortcuts:
-            return TaskRefusal(RefusalReason.SHORTCUT, shortcut_in_words(found, draft.task.table))
         return self._hidden_obstacle(simulator, draft) or plan
 
     def _hidden_obstacle(self, simulator: Simulator, draft: Draft) -> TaskRefusal | None:
@@ -171,8 +163,9 @@ class _DayWork:
         """
         task = draft.task
         atoms = tuple(atom for atom, _ in task.goal_atoms)
+        situation = situation_of(simulator.world.scene, task)
         for order in (atoms, atoms[::-1]):
-            plan = greedy_plan(replace(task, goal=And(order)), situation_of(simulator.world.scene, task))
+            plan = greedy_plan(replace(task, goal=And(order)), situation)
             trace = simulator.execute(task, plan, SEED)
             if trace.failure in SPATIAL:
                 sentence = (
@@ -188,16 +181,5 @@ class _DayWork:
         self._rejections.append(rejection)
 
     def _result(self, digest: str) -> VariantResult:
-        records: Sequence[TaskRecord] = [
-            TaskRecord(
-                task=draft.task,
-                bundle_digest=digest,
-                split=self._order.split,
-                oracle=tuple(plan_to_json(plan)),
-                rooms=draft.rooms,
-                signature=draft.signature,
-                intent=draft.intent,
-            )
-            for draft, plan in self._admitted
-        ]
-        return VariantResult(self._order.split, self._order.number, tuple(records), tuple(self._rejections))
+        records = tuple(record_of(draft, plan, digest, self._order.split) for draft, plan in self._admitted)
+        return VariantResult(self._order.split, self._order.number, records, tuple(self._rejections))

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
-from embomatrix.factory.days.drafts import Members, PlannedTask, appliances_for, task_of
-from embomatrix.factory.days.laying import lay_out
+from embomatrix.factory.days.drafts import Members, PlannedTask, draft_of, task_of
+from embomatrix.factory.days.laying import SEEDS, lay_out
 from embomatrix.factory.days.planning import PlannedDay, day_name
 from embomatrix.factory.language.nouns import noun_of
 from embomatrix.factory.layout.request import LayoutAgents
@@ -22,15 +22,11 @@ from embomatrix.factory.social.day import wanted_kinds
 from embomatrix.factory.social.model.writer import ModelWriter
 from embomatrix.factory.social.scene_kinds import kinds_of
 from embomatrix.factory.social.written import WrittenRequest
-from embomatrix.factory.task_import.task_fields import signature_of
-from embomatrix.factory.writer.tasks import Draft
-from embomatrix.world.intent import goal_clauses
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
 REQUESTS_OF_DAY: Final = 6
 """Number of requests that a day asks the model for."""
-SEEDS: Final = 2**31
 
 
 class ModelDays:
@@ -96,15 +92,7 @@ def planned_task(
                 RefusalReason.UNFAITHFUL,
                 f"the words for {'/'.join(names)} also fit {other}: say which one is meant",
             )
-    draft = Draft(
-        task=task,
-        about=tuple(dict.fromkeys((*about, *appliances_for(view, task, about)))),
-        rooms=tuple(sorted({view.room(name) for names in wanted.values() for name in names})),
-        signature=signature_of(task.goal, view),
-        intent=goal_clauses(task.goal, task.types),
-        transcript=request.transcript(),
-    )
-    return PlannedTask(draft, request.conversation)
+    return PlannedTask(draft_of(view, task, wanted, about, request.transcript()), request.conversation)
 
 
 def _also_meant(view: SceneView, task: Task, names: Sequence[str]) -> str:

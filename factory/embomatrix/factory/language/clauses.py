@@ -65,7 +65,7 @@ def _phrases() -> Mapping[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class NounPhrase:
-    """Words for objects. ``pronoun_number`` is 1 for *it* and more for *them*."""
+    """Words for objects. ``count`` is 1 for *it* and more for *them*."""
 
     words: str
     count: int = 1
@@ -122,7 +122,7 @@ class Clause:
 
 
 class PhraseBook:
-    """Verbs, states and sentence forms that tasks of one split may use. ``held_out_only`` prefers words kept for it."""
+    """Verbs, states and sentence forms that tasks of one split may use."""
 
     def __init__(self, split: str, seed: int) -> None:
         self._split = split

@@ -6,7 +6,7 @@ The table is ``kinds.toml`` beside this module.
 import functools
 import hashlib
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from typing import Final
@@ -51,8 +51,3 @@ def kinds_with(categories: frozenset[str]) -> tuple[Kind, ...]:
 def is_held_out(words: str, seed: int, one_of: int) -> bool:
     """True if these words are kept for the held-out split: a hash draw of one in ``one_of``, fixed for a seed."""
     return hashlib.sha256(f"{seed} {words}".encode()).digest()[0] % one_of == 0
-
-
-def known_to(split: str, words: Iterable[str], seed: int, one_of: int) -> frozenset[str]:
-    """Return the words that tasks of this split may use: all for the held-out split."""
-    return frozenset(each for each in words if split == "heldout" or not is_held_out(each, seed, one_of))

@@ -120,6 +120,32 @@ def uniqueness_key(signature: str, instruction: str) -> str:
     return f"{signature}|{instruction}"
 
 
+def prove(
+    simulator: Simulator, draft: Draft, shortcut_plans: int, physics: Simulator | None
+) -> Plan | TaskRefusal:
+    """Return a plan that reaches the draft's goal, in stepped physics too if given. No plan tried shows a shortcut."""
+    plan = admit(simulator, draft.task, find_plan, physics=physics)
+    if isinstance(plan, TaskRefusal):
+        return plan
+    found = find_shortcuts(simulator, draft.task, draft.intent, plan, shortcut_plans)
+    if found.shortcuts:
+        return TaskRefusal(RefusalReason.SHORTCUT, shortcut_in_words(found, draft.task.table))
+    return plan
+
+
+def record_of(draft: Draft, plan: Plan, digest: str, split: str) -> TaskRecord:
+    """Return the record of an admitted draft in the bundle with this digest."""
+    return TaskRecord(
+        task=draft.task,
+        bundle_digest=digest,
+        split=split,
+        oracle=tuple(plan_to_json(plan)),
+        rooms=draft.rooms,
+        signature=draft.signature,
+        intent=draft.intent,
+    )
+
+
 def _focus(
     base: Scene, rooms: Sequence[str], missing: Mapping[TaskCategory, int], rng: np.random.Generator
 ) -> tuple[str, ...]:
@@ -278,14 +304,7 @@ class _VariantWork:
         findings = audit(task, draft.intent, SceneView(self._variant.scene))
         if findings:
             return TaskRefusal(RefusalReason.UNFAITHFUL, findings[0])
-        plan = admit(simulator, task, find_plan, physics=physics)
-        if isinstance(plan, TaskRefusal):
-            return plan
-        plans = self._maker.settings.shortcut_plans
-        found = find_shortcuts(simulator, task, draft.intent, plan, plans)
-        if found.shortcuts:
-            return TaskRefusal(RefusalReason.SHORTCUT, shortcut_in_words(found, task.table))
-        return plan
+        return prove(simulator, draft, self._maker.settings.shortcut_plans, physics)
 
     def _reject(
         self, category: TaskCategory, refusal: TaskRefusal, instruction: str = "", goal: str = ""
@@ -302,16 +321,5 @@ class _VariantWork:
         )
 
     def _result(self, digest: str) -> VariantResult:
-        records = tuple(
-            TaskRecord(
-                draft.task,
-                digest,
-                self._order.split,
-                tuple(plan_to_json(plan)),
-                draft.rooms,
-                draft.signature,
-                draft.intent,
-            )
-            for draft, plan in self._admitted
-        )
+        records = tuple(record_of(draft, plan, digest, self._order.split) for draft, plan in self._admitted)
         return VariantResult(self._order.split, self._order.number, records, tuple(self._rejections))

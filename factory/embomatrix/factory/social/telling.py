@@ -20,7 +20,7 @@ from embomatrix.factory.language.clauses import (
     sentence_of,
 )
 from embomatrix.factory.language.nouns import listed, noun_of, number_word
-from embomatrix.factory.language.references import Describer, all_of, any_of, exactly, together
+from embomatrix.factory.language.references import Describer, Description, all_of, any_of, exactly, together
 from embomatrix.factory.social.day import NeedOfDay
 from embomatrix.factory.social.household import is_female
 from embomatrix.factory.social.wish import PLACED, THERMAL, Condition, Quantity, WishPredicate
@@ -143,9 +143,7 @@ class Teller:
         is_place = any(each.place == label for each in asked.conditions)
         if len(names) == 1 or not (is_free or is_place):
             return self._definite(names)
-        found = self.describer.describe(names)
-        if found is None:
-            raise UndescribableError(", ".join(names))
+        found = self._described(names)
         many = self.describer.phrase(found, len(names))
         return (
             many
@@ -173,6 +171,12 @@ class Teller:
         if third == "their":
             third = "her" if is_female(need.person.name) else "his"
         return third if speaker.name else first
+
+    def _described(self, names: Sequence[str]) -> Description:
+        found = self.describer.describe(names)
+        if found is None:
+            raise UndescribableError(", ".join(names))
+        return found
 
     def _definite(self, names: Sequence[str]) -> str:
         words = self.describer.definite(names)
@@ -270,9 +274,7 @@ class Teller:
         return NounPhrase(f"either {listed(words, 'or')}")
 
     def _quantified(self, condition: Condition, names: Sequence[str]) -> NounPhrase:
-        found = self.describer.describe(names)
-        if found is None:
-            raise UndescribableError(", ".join(names))
+        found = self._described(names)
         match condition.quantity:
             case Quantity.ANY:
                 return (
@@ -289,9 +291,7 @@ class Teller:
 
     def _place(self, condition: Condition, members: Mapping[str, tuple[str, ...]]) -> str:
         names = members[condition.place]
-        found = self.describer.describe(names)
-        if found is None:
-            raise UndescribableError(", ".join(names))
+        found = self._described(names)
         if condition.quantity is Quantity.PAIRED:
             return self.describer.phrase(found, 1, "each")
         if len(names) == 1:
