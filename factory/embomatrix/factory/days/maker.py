@@ -78,7 +78,9 @@ class DayMaker:
         self._library.close()
 
 
-DAYS: Final = Making(DayMaker, whole_scenes=True)
+TASKS_PER_DAY: Final = 2
+"""Number of tasks that a day should yield. With the analysis of the arm and the proof in physics, many needs drop out."""
+DAYS: Final = Making(DayMaker, whole_scenes=True, tasks=TASKS_PER_DAY)
 """Making of days in whole scenes."""
 
 

@@ -136,11 +136,13 @@ class Maker(Protocol):
 class Making:
     """Way in which variants are made. ``begin`` starts a maker from the settings, in each process of the build.
 
-    If ``whole_scenes``, the held-out tasks lie in scenes of their own, otherwise in rooms of their own.
+    If ``whole_scenes``, the held-out tasks lie in scenes of their own, otherwise in rooms of their own. ``tasks`` is the
+    number of tasks that a variant should yield.
     """
 
     begin: Callable[..., Maker]
     whole_scenes: bool = False
+    tasks: int = TASKS_PER_VARIANT
 
 
 def _make(maker: Maker, order: VariantOrder) -> VariantYield:
@@ -225,7 +227,9 @@ def build_dataset(
     begin, arguments = (making.begin, (settings,)) if making else (VariantMaker, (settings, writer, layout))
     with shared_work(1 if here else jobs, begin, _make, *arguments, died=died) as make:
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
-            orders = _SplitOrders(store, bases, rooms[split], split, target)
+            orders = _SplitOrders(
+                store, bases, rooms[split], split, target, making.tasks if making else TASKS_PER_VARIANT
+            )
             while round_orders := orders.next_round():
                 progress(split, orders.admitted)
                 for variant in make(round_orders):
@@ -247,13 +251,15 @@ class _SplitOrders:
         rooms: Mapping[str, tuple[str, ...]],
         split: str,
         target: int,
+        tasks: int,
     ) -> None:
         self._store = store
+        self._tasks = tasks
         self._usable = [base.base for base in bases if _is_usable(base, rooms[base.base])]
         self._rooms = rooms
         self._split = split
         self._quota = {category: _share(target, index) for index, category in enumerate(TaskCategory)}
-        self._end = VARIANTS_PER_FULL * (target // TASKS_PER_VARIANT + 1)
+        self._end = VARIANTS_PER_FULL * (target // tasks + 1)
         self._number = 0
 
     @property
@@ -269,7 +275,7 @@ class _SplitOrders:
             missing = self._missing(self._number)
             if not any(missing.values()):
                 break
-            wanted = -(-sum(missing.values()) // TASKS_PER_VARIANT)
+            wanted = -(-sum(missing.values()) // self._tasks)
             numbers = range(self._number, min(self._number + min(ROUND_VARIANTS, wanted), self._end))
             known = self._known(self._number)
             self._number = numbers.stop
