@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -16,7 +16,7 @@ from embomatrix.factory.social.day import NeedOfDay
 from embomatrix.factory.social.dialogue import converse, transcript_of
 from embomatrix.factory.social.telling import Asked, Teller, UndescribableError
 from embomatrix.factory.social.values import Cast, Conversation
-from embomatrix.factory.social.wish import Condition, Quantity, WishPredicate, goal_of
+from embomatrix.factory.social.wish import PAIRS, Condition, Quantity, WishPredicate, goal_of
 from embomatrix.factory.task_import.reach import profile_for
 from embomatrix.factory.task_import.task_fields import signature_of, sources_for, taps_for
 from embomatrix.factory.writer.categories import category_of
@@ -31,7 +31,11 @@ from embomatrix.world.task import Task
 
 Members = Mapping[str, tuple[str, ...]]
 NEEDS_OF_TASK: Final = (1, 1, 1, 2, 2, 3)
-"""Numbers of needs that one task joins; each entry is equally likely."""
+"""Numbers of needs of one event that a task joins; each entry is equally likely."""
+NEEDS_OF_LONG_TASK: Final = (3, 4, 5, 6)
+"""Numbers of needs of one person that a long task joins, which may belong to several events."""
+MAX_HOURS_APART: Final = 4
+"""Maximum time between the events of a long task."""
 MAX_ROWS: Final = 40
 """Maximum number of rows of a table, so that a person can read the prompt."""
 
@@ -55,14 +59,17 @@ class PlannedTask:
 
 @dataclass(frozen=True, slots=True)
 class Combination:
-    """Needs of one event that one task joins, with the objects of each need by label."""
+    """Needs of one person that one task joins, by the hour of their events, with the objects of each need by label."""
 
     needs: tuple[NeedOfDay, ...]
     members: tuple[Members, ...]
 
 
 def combinations_of(day: DayScene, rng: np.random.Generator) -> list[Combination]:
-    """Return the needs of the day in groups of one event. Each need belongs to one group."""
+    """Return the needs of the day in groups of one event, then a long group of each person with enough needs.
+
+    Each need belongs to one group of its event, and may belong to a long group besides.
+    """
     found: list[Combination] = []
     by_event: dict[str, list[int]] = {}
     for number, need in enumerate(day.needs):
@@ -72,9 +79,30 @@ def combinations_of(day: DayScene, rng: np.random.Generator) -> list[Combination
         while left:
             size = min(len(left), NEEDS_OF_TASK[int(rng.integers(len(NEEDS_OF_TASK)))])
             chosen, left = left[:size], left[size:]
-            needs = tuple(day.needs[at] for at in chosen)
-            found.append(Combination(needs, tuple(day.members[at] for at in chosen)))
-    return found
+            found.append(_combination(day, chosen))
+    return [*found, *_long_combinations(day, [each.needs for each in found], rng)]
+
+
+def _long_combinations(
+    day: DayScene, known: Collection[tuple[NeedOfDay, ...]], rng: np.random.Generator
+) -> Iterator[Combination]:
+    by_person: dict[str, list[int]] = {}
+    for number, need in enumerate(day.needs):
+        by_person.setdefault(need.person.name, []).append(number)
+    for numbers in by_person.values():
+        order = [numbers[int(at)] for at in rng.permutation(len(numbers))]
+        size = NEEDS_OF_LONG_TASK[int(rng.integers(len(NEEDS_OF_LONG_TASK)))]
+        hour = day.needs[order[0]].hour
+        near = [at for at in order if abs(day.needs[at].hour - hour) <= MAX_HOURS_APART / 2][:size]
+        joined = _combination(
+            day, sorted(near, key=lambda at: (day.needs[at].hour, day.needs[at].event.name))
+        )
+        if len(near) >= NEEDS_OF_LONG_TASK[0] and joined.needs not in known:
+            yield joined
+
+
+def _combination(day: DayScene, chosen: Sequence[int]) -> Combination:
+    return Combination(tuple(day.needs[at] for at in chosen), tuple(day.members[at] for at in chosen))
 
 
 class DraftWriter:
@@ -230,7 +258,7 @@ def _types(view: SceneView, conditions: Sequence[Condition], members: Members) -
     types: dict[str, str] = {}
     for condition in conditions:
         for label in (condition.things, condition.place):
-            if not label or (len(members[label]) < 2 and condition.quantity is not Quantity.PAIRED):
+            if not label or (len(members[label]) < 2 and condition.quantity not in PAIRS):
                 continue
             synset = view.asset(members[label][0]).synset
             taken = {members[other] for other, known in types.items() if known == synset}

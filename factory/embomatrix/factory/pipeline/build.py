@@ -5,6 +5,7 @@ round. Therefore the dataset does not depend on the number of processes.
 """
 
 import dataclasses
+import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -137,12 +138,14 @@ class Making:
     """Way in which variants are made. ``begin`` starts a maker from the settings, in each process of the build.
 
     If ``whole_scenes``, the held-out tasks lie in scenes of their own, otherwise in rooms of their own. ``tasks`` is the
-    number of tasks that a variant should yield.
+    number of tasks that a variant should yield. ``most`` is the largest share of a category; None makes
+    all categories equal.
     """
 
     begin: Callable[..., Maker]
     whole_scenes: bool = False
     tasks: int = TASKS_PER_VARIANT
+    most: float | None = None
 
 
 def _make(maker: Maker, order: VariantOrder) -> VariantYield:
@@ -224,12 +227,14 @@ def build_dataset(
         "same command again with fewer --jobs"
     )
     here = writer is not None or layout is not None
-    begin, arguments = (making.begin, (settings,)) if making else (VariantMaker, (settings, writer, layout))
-    with shared_work(1 if here else jobs, begin, _make, *arguments, died=died) as make:
+    if making is None:
+        making = Making(VariantMaker)
+        begin_with: tuple[object, ...] = (settings, writer, layout)
+    else:
+        begin_with = (settings,)
+    with shared_work(1 if here else jobs, making.begin, _make, *begin_with, died=died) as make:
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
-            orders = _SplitOrders(
-                store, bases, rooms[split], split, target, making.tasks if making else TASKS_PER_VARIANT
-            )
+            orders = _SplitOrders(store, bases, rooms[split], split, target, making)
             while round_orders := orders.next_round():
                 progress(split, orders.admitted)
                 for variant in make(round_orders):
@@ -251,15 +256,19 @@ class _SplitOrders:
         rooms: Mapping[str, tuple[str, ...]],
         split: str,
         target: int,
-        tasks: int,
+        making: Making,
     ) -> None:
         self._store = store
-        self._tasks = tasks
+        self._target = target
+        self._tasks = making.tasks
         self._usable = [base.base for base in bases if _is_usable(base, rooms[base.base])]
         self._rooms = rooms
         self._split = split
-        self._quota = {category: _share(target, index) for index, category in enumerate(TaskCategory)}
-        self._end = VARIANTS_PER_FULL * (target // tasks + 1)
+        self._quota = {
+            category: _share(target, index) if making.most is None else math.ceil(target * making.most)
+            for index, category in enumerate(TaskCategory)
+        }
+        self._end = VARIANTS_PER_FULL * (target // making.tasks + 1)
         self._number = 0
 
     @property
@@ -275,7 +284,7 @@ class _SplitOrders:
             missing = self._missing(self._number)
             if not any(missing.values()):
                 break
-            wanted = -(-sum(missing.values()) // self._tasks)
+            wanted = -(-min(sum(missing.values()), self._left(self._number)) // self._tasks)
             numbers = range(self._number, min(self._number + min(ROUND_VARIANTS, wanted), self._end))
             known = self._known(self._number)
             self._number = numbers.stop
@@ -294,9 +303,10 @@ class _SplitOrders:
         """Store a variant's result without duplicates of its round and without surplus tasks."""
         number = variant.result.number
         left, known = self._missing(number), self._known(number)
-        kept = []
+        most = self._left(number)
+        kept: list[TaskRecord] = []
         for record in variant.result.records:
-            if left[record.task.category] > 0 and _key(record) not in known:
+            if len(kept) < most and left[record.task.category] > 0 and _key(record) not in known:
                 left[record.task.category] -= 1
                 kept.append(record)
         names = {record.task.task_id for record in kept}
@@ -309,9 +319,16 @@ class _SplitOrders:
         self._store.add(kept_variant)
 
     def _missing(self, before: int) -> dict[TaskCategory, int]:
-        """Return the number of tasks of each category that are missing before this variant."""
+        """Return the number of tasks of each category that may be added before this variant."""
         done = Counter(record.task.category for record in self._before(before))
-        return {category: max(0, quota - done[category]) for category, quota in self._quota.items()}
+        left = max(0, self._target - done.total())
+        return {
+            category: min(left, max(0, quota - done[category])) for category, quota in self._quota.items()
+        }
+
+    def _left(self, before: int) -> int:
+        """Return the number of tasks that are missing before this variant."""
+        return max(0, self._target - sum(1 for _ in self._before(before)))
 
     def _known(self, before: int) -> frozenset[str]:
         return frozenset(_key(record) for record in self._before(before))

@@ -17,7 +17,14 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.household import place_of
 from embomatrix.factory.social.knowledge import Event, GoalPart, Need, ObjectRole, events
 from embomatrix.factory.social.values import Cast, Person
-from embomatrix.factory.social.wish import FLOOR, Condition, Quantity, Wish, WishedObjects, WishPredicate
+from embomatrix.factory.social.wish import (
+    COUNTED,
+    FLOOR,
+    Condition,
+    Wish,
+    WishedObjects,
+    WishPredicate,
+)
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation, State
 
@@ -52,6 +59,12 @@ class NeedOfDay:
     need: Need
     wish: Wish
     count: int
+
+    @property
+    def hour(self) -> float:
+        """Hours since midnight."""
+        hour, minute = map(int, self.clock.split(":"))
+        return hour + minute / 60
 
     @property
     def time(self) -> str:
@@ -152,7 +165,7 @@ def _condition(part: GoalPart, count: int) -> Condition:
         things=part.things,
         place=part.place,
         quantity=part.quantity,
-        count=count if part.quantity is Quantity.EXACTLY else 0,
+        count=count if part.quantity in COUNTED else 0,
         holds=part.holds,
         otherwise=_condition(part.otherwise, count) if part.otherwise is not None else None,
     )
@@ -241,7 +254,7 @@ def _can_open(kind: str) -> bool:
 
 def _count(need: Need, groups: Mapping[str, WishedObjects], rng: np.random.Generator) -> int | None:
     """Return the number k of the need, less than the number of objects; 0 without one, None if there are too few objects."""
-    counted = [groups[part.things].count for part in need.goal if part.quantity is Quantity.EXACTLY]
+    counted = [groups[part.things].count for part in need.goal if part.quantity in COUNTED]
     if not counted:
         return 0
     if need.count:

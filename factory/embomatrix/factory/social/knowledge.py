@@ -23,7 +23,7 @@ _OBJECTS: Final = re.compile(
     r"(?: @(?P<rooms>[\w|]+)| (?P<relation>on|in|under|by) (?P<host>\w+))"
 )
 _GOAL: Final = re.compile(
-    r"(?:(?P<quantity>any|none|k of|paired) )?(?P<things>\w+) "
+    r"(?:(?P<quantity>any|none|k of|k paired|paired) )?(?P<things>\w+) "
     r"(?:(?P<relation>on|in|under|by) (?P<place>\w+)|(?P<state>[\w!]+)(?: with (?P<source>\w+))?)"
 )
 _RELATIONS: Final = {
@@ -51,6 +51,7 @@ _QUANTITIES: Final = {
     "none": Quantity.NONE,
     "k of": Quantity.EXACTLY,
     "paired": Quantity.PAIRED,
+    "k paired": Quantity.SOME_PAIRED,
 }
 
 

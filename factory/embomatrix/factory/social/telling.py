@@ -5,10 +5,11 @@ A request is told by its clauses, or by a sentence that implies them. The descri
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from embomatrix.factory.language.clauses import (
     Clause,
@@ -23,7 +24,8 @@ from embomatrix.factory.language.nouns import listed, noun_of, number_word
 from embomatrix.factory.language.references import Describer, Description, all_of, any_of, exactly, together
 from embomatrix.factory.social.day import NeedOfDay
 from embomatrix.factory.social.household import is_female
-from embomatrix.factory.social.wish import PLACED, THERMAL, Condition, Quantity, WishPredicate
+from embomatrix.factory.social.knowledge import Event
+from embomatrix.factory.social.wish import PAIRS, PLACED, THERMAL, Condition, Quantity, WishPredicate
 from embomatrix.factory.writer.words import Voice
 
 IMPLIED_SHARE: Final = 0.5
@@ -37,17 +39,12 @@ BEFORE_SHARE: Final = 0.35
 """Share of instructions that say by when, if the event has words for it."""
 SAME_SHARE: Final = 0.6
 """Share of requests that only refer to the one before, if they ask for the same of other things."""
-AT_THE_END: Final = (
-    "In the end",
-    "When you",
-    "Before",
-    "By the time",
-    "The same",
-    "And ",
-    "Do the same",
-    "Likewise",
+_TAKES_NO_JOINT: Final = re.compile(
+    r"(In the end|When you|The same|And |Do the same|Likewise|Nobody has|Why |There is one|How about)"
+    r"|.*( (is|are) still | can't stay | now and should be |too, please\.$|\?$)"
 )
-"""Beginnings of sentences that take no joint."""
+"""Sentences that read badly after *first* or *finally*."""
+PRONOUNS: Final = ("She", "He")
 LIGHTS: Final = frozenset({"table_lamp", "floor_lamp"})
 BINS: Final = ("trash_can", "_bin")
 TAPS: Final = ("_sink", "bathtub")
@@ -71,6 +68,13 @@ class Asked:
     conditions: Sequence[Condition]
 
 
+class _Said(NamedTuple):
+    """Sentence of an instruction. Requests can take joints, sentences that imply them can't."""
+
+    sentence: str
+    is_request: bool
+
+
 @dataclass(frozen=True)
 class Teller:
     """Teller of needs to the robot."""
@@ -87,14 +91,31 @@ class Teller:
         why = self._personal(_naming(self.voice.choose(first.event.why)), first, speaker)
         is_named = bool(speaker.name) and speaker.name in why
         later = Speaker("She" if is_female(speaker.name) else "He") if is_named else speaker
-        said = [sentence for each in asked for sentence in self._requests(each, later)]
-        if first.event.before and not said[0].startswith(AT_THE_END) and self._rng() < BEFORE_SHARE:
-            said[0] = (
-                f"{capitalised(self.voice.choose(first.event.before))}, {_lowered(said[0], (speaker.name,))}"
+        parts = [greeting + capitalised(why)]
+        for event, group in itertools.groupby(asked, key=lambda each: each.need.event):
+            needs = list(group)
+            if event is not first.event:
+                parts.append(self._turn_to(needs[0].need, later))
+            parts.append(
+                self._joined([said for each in needs for said in self._requests(each, later)], speaker.name)
             )
-        text = f"{greeting}{capitalised(why)} {self._joined(said, speaker.name)}"
-        text = _INNER_PRONOUN.sub(lambda match: match.group(0).lower(), text)
+            if event.before and self._rng() < BEFORE_SHARE:
+                parts.append(
+                    self._deadline(event, later, is_one=len(needs) == 1 and len(needs[0].conditions) == 1)
+                )
+        text = _INNER_PRONOUN.sub(lambda match: match.group(0).lower(), " ".join(parts))
         return text if first.person.name in text else f"{first.person.name} says: {text}"
+
+    def _turn_to(self, need: NeedOfDay, speaker: Speaker) -> str:
+        """Return the reason of a later event, after words that turn to another matter."""
+        why = self._personal(self.voice.choose(need.event.why), need, speaker)
+        return f"{self.voice.choose(self.book.joints('turn'))}{capitalised(why)}"
+
+    def _deadline(self, event: Event, speaker: Speaker, *, is_one: bool) -> str:
+        """Return a sentence about the time by which the requests are to be met."""
+        words = self.voice.choose(self.book.joints("by one" if is_one else "by"))
+        before = self.voice.choose(event.before)
+        return words.format(before=before, **speaker.fields())
 
     def reason(self, need: NeedOfDay) -> str:
         """Return a sentence about the event in the first person."""
@@ -103,24 +124,23 @@ class Teller:
     def _rng(self) -> float:
         return float(self.voice.rng.random())
 
-    def _joined(self, sentences: Sequence[str], name: str) -> str:
+    def _joined(self, said: Sequence[_Said], name: str) -> str:
         """Return the sentences with joints before some of them. ``name`` is the speaker's."""
         told = []
-        for number, sentence in enumerate(sentences):
+        for number, (sentence, is_request) in enumerate(said):
             if name and number and sentence.startswith(f"{name} "):
                 sentence = f"{'She' if is_female(name) else 'He'}{sentence.removeprefix(name)}"
-            last = number == len(sentences) - 1
+            last = number == len(said) - 1
             kind = "first" if not number else "last" if last else "next"
-            is_plain = len(sentences) > 1 and not sentence.startswith(AT_THE_END)
-            is_plain = is_plain and not sentence.endswith(("too, please.", "?"))
-            joint = self.voice.choose(self.book.joints(kind)) if is_plain else ""
+            takes_joint = is_request and len(said) > 1 and not _TAKES_NO_JOINT.match(sentence)
+            joint = self.voice.choose(self.book.joints(kind)) if takes_joint else ""
             told.append(f"{joint}{_lowered(sentence, (name,))}" if joint else sentence)
         return " ".join(told)
 
-    def _requests(self, asked: Asked, speaker: Speaker) -> list[str]:
+    def _requests(self, asked: Asked, speaker: Speaker) -> list[_Said]:
         if asked.need.need.say and not self._leaves_choice(asked) and self._rng() < IMPLIED_SHARE:
-            return [self._implied(asked, speaker)]
-        return self._clauses(asked, speaker)
+            return [_Said(self._implied(asked, speaker), is_request=False)]
+        return [_Said(sentence, is_request=True) for sentence in self._clauses(asked, speaker)]
 
     def _leaves_choice(self, asked: Asked) -> bool:
         """True if a place may be any of several pieces of furniture, which sentences of needs don't provide for."""
@@ -156,9 +176,10 @@ class Teller:
         text = _CHOICE.sub(lambda match: self._choice(match, need, speaker), text)
         their = "her" if is_female(need.person.name) else "his"
         them = "her" if is_female(need.person.name) else "him"
+        possessive = their.capitalize() if speaker.name in PRONOUNS else f"{speaker.name}'s"
         fields = {
             "I": speaker.name or "I",
-            "my": f"{speaker.name}'s" if speaker.name else "my",
+            "my": possessive if speaker.name else "my",
             "their": their if speaker.name else "my",
             "me": them if speaker.name else "me",
             "Me": speaker.name or "me",
@@ -191,7 +212,7 @@ class Teller:
         last = ("", "")
         for group in self._grouped([each for each in asked.conditions if not _is_implied(each, asked)]):
             names = frozenset(name for each in group for name in asked.members[each.things])
-            counted = group[0].quantity in (Quantity.ANY, Quantity.EXACTLY, Quantity.PAIRED)
+            counted = group[0].quantity in (Quantity.ANY, Quantity.EXACTLY, *PAIRS)
             bare = names == before and not counted and self._rng() < PRONOUN_SHARE
             clause = self._clause(group, asked.members, bare=bare)
             act = (clause.key, clause.place)
@@ -282,7 +303,7 @@ class Teller:
                     if len(names) > 1
                     else all_of(self.describer, found, 1)
                 )
-            case Quantity.EXACTLY:
+            case Quantity.EXACTLY | Quantity.SOME_PAIRED:
                 return exactly(self.describer, found, condition.count, len(names))
             case Quantity.PAIRED:
                 return NounPhrase(self.describer.phrase(found, len(names), "one of the"))
@@ -294,6 +315,8 @@ class Teller:
         found = self._described(names)
         if condition.quantity is Quantity.PAIRED:
             return self.describer.phrase(found, 1, "each")
+        if condition.quantity is Quantity.SOME_PAIRED:
+            return self.describer.phrase(found, len(names), self.voice.choose(("different", "separate")))
         if len(names) == 1:
             return self.describer.phrase(found, 1)
         kind = "any of the" if condition.predicate not in THERMAL else "one of the"

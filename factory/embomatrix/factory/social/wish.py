@@ -63,6 +63,13 @@ class Quantity(StrEnum):
     EXACTLY = "exactly"
     NONE = "none"
     PAIRED = "paired"  # one object for each place: a cup on each saucer
+    SOME_PAIRED = "some_paired"  # an exact number of objects, each at a place of its own
+
+
+COUNTED: Final = (Quantity.EXACTLY, Quantity.SOME_PAIRED)
+"""Quantities with a number."""
+PAIRS: Final = frozenset({Quantity.PAIRED, Quantity.SOME_PAIRED})
+"""Quantities of one-to-one pairs of objects and places."""
 
 
 class WishedObjects(StrictModel):
@@ -88,8 +95,8 @@ class WishedObjects(StrictModel):
 class Condition(StrictModel):
     """Condition on a group of objects. ``place`` is the group of its hosts, or of thermal sources if the wish names one.
 
-    ``count`` belongs to the quantity EXACTLY. ``otherwise`` is an alternative condition. ``provided`` is the premise of the
-    condition. ``holds`` is false for the contrary, such as closed or switched off.
+    ``count`` belongs to the quantities EXACTLY and SOME_PAIRED. ``otherwise`` is an alternative condition. ``provided`` is
+    the premise of the condition. ``holds`` is false for the contrary, such as closed or switched off.
     """
 
     predicate: WishPredicate
@@ -108,9 +115,10 @@ class Condition(StrictModel):
             raise ValueError(f"{self.predicate.value} takes a place: name the label of a group")
         if self.place and not placed and self.predicate not in THERMAL:
             raise ValueError(f"{self.predicate.value} takes no place, found {self.place!r}")
-        if (self.quantity is Quantity.EXACTLY) != bool(self.count):
+        if (self.quantity in COUNTED) != bool(self.count):
+            takers = " and ".join(repr(each.value) for each in COUNTED)
             raise ValueError(
-                f"count is {self.count} with the quantity {self.quantity.value}: only 'exactly' takes one"
+                f"count is {self.count} with the quantity {self.quantity.value}: expected one with {takers} only"
             )
         return self
 
@@ -193,11 +201,12 @@ def _quantified(
     things, places = members[condition.things], members.get(condition.place, ())
     type_name, place_type = types.get(condition.things, ""), types.get(condition.place, "")
     negated = condition.holds is (condition.quantity is Quantity.NONE)
-    if condition.quantity is Quantity.PAIRED:
+    if condition.quantity in PAIRS:
         binders = ((f"?{type_name}", type_name), (f"?{place_type}", place_type))
-        return Quantified(
-            Quantifier.FORPAIRS, binders, Atom(condition.predicate.value, tuple(name for name, _ in binders))
-        )
+        atom = Atom(condition.predicate.value, tuple(name for name, _ in binders))
+        if condition.quantity is Quantity.PAIRED:
+            return Quantified(Quantifier.FORPAIRS, binders, atom)
+        return Quantified(Quantifier.FORNPAIRS, binders, atom, condition.count)
 
     def about(thing: str) -> Formula:
         found = _at_some_place(condition.predicate.value, thing, places, place_type)

@@ -11,6 +11,7 @@ from embomatrix.factory.social.rules.nouns import fits, mentions_in, tokens_of
 from embomatrix.factory.social.scene_kinds import SceneKinds
 from embomatrix.factory.social.values import StrictModel
 from embomatrix.factory.social.wish import (
+    COUNTED,
     MAX_CONDITIONS,
     MAX_COUNT,
     Condition,
@@ -80,7 +81,7 @@ def _condition_of(demand: Demand, wish: Wish, scene: SceneKinds) -> Condition | 
             things=things,
             place=place,
             quantity=demand.quantity,
-            count=demand.count if demand.quantity is Quantity.EXACTLY else 0,
+            count=demand.count if demand.quantity in COUNTED else 0,
             holds=demand.holds,
             otherwise=parts.get("otherwise"),
             provided=parts.get("provided"),

@@ -263,7 +263,7 @@ def _is_counted(condition: Condition, group: WishedObjects, mention: Mention, re
     number = next((NUMBERS.get(word) or int(word) for word in told if word in NUMBERS or word.isdigit()), 0)
     quantity = condition.quantity if group.count > 1 else Quantity.ALL
     match quantity:
-        case Quantity.EXACTLY:
+        case Quantity.EXACTLY | Quantity.SOME_PAIRED:
             return number == condition.count and not words & _LIMITS
         case Quantity.ANY:
             return bool(words & INDEFINITE) and not words & (UNIVERSAL - {"everything"})
@@ -288,6 +288,7 @@ def _count_sentence(condition: Condition, group: WishedObjects) -> str:
         Quantity.ANY: "any one",
         Quantity.NONE: "none",
         Quantity.PAIRED: "one for each place",
+        Quantity.SOME_PAIRED: f"exactly {condition.count}, each at a place of its own",
     }.get(condition.quantity, f"all {group.count}" if group.count > 1 else "one")
     return (
         f"a condition is about {wanted} of {group.count} {group.label}, and the instruction counts otherwise"

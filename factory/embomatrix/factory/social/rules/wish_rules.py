@@ -8,6 +8,7 @@ from embomatrix.factory.social.rules.faults import Fault, FaultKind
 from embomatrix.factory.social.rules.kinds import KindAbilities, abilities_of, can_become, effects_of
 from embomatrix.factory.social.scene_kinds import SceneKinds
 from embomatrix.factory.social.wish import (
+    COUNTED,
     FLOOR,
     PLACED,
     THERMAL,
@@ -144,7 +145,7 @@ def _hosting(guest: WishedObjects, predicate: WishPredicate, host: WishedObjects
 def _held(condition: Condition, wish: Wish, scene: SceneKinds) -> Iterator[Fault]:
     if condition.otherwise is not None or condition.provided is not None:
         return
-    if condition.quantity is Quantity.EXACTLY:
+    if condition.quantity in COUNTED:
         return
     if _holds_at_start(condition, wish, scene) is not is_negative(condition):
         things = wish.groups[condition.things]
@@ -179,7 +180,7 @@ def _contradictions(wish: Wish) -> Iterator[Fault]:
 
 def _excludes(first: Condition, second: Condition) -> bool:
     """True if no object can meet both conditions on the same group."""
-    if any(each.quantity in (Quantity.ANY, Quantity.EXACTLY) for each in (first, second)):
+    if any(each.quantity in (Quantity.ANY, *COUNTED) for each in (first, second)):
         return False
     if any(each.otherwise or each.provided for each in (first, second)):
         return False
