@@ -67,7 +67,9 @@ def difficulty(
         shares_of_policy = read_policy_shares(policy) if policy is not None else {}
         dataset = Dataset.load(folder)
         missing = [record for record in dataset.records if again or record.difficulty is None]
-        results = _results(dataset, missing, dataset if training is None else Dataset.load(training), jobs)
+        results = script_results(
+            dataset, missing, dataset if training is None else Dataset.load(training), jobs
+        )
         records = with_policy(with_scripts(dataset.records, results), shares_of_policy)
         write_whole(folder / TASKS_FILE, encode_records(records))
         _print_levels(records)
@@ -79,9 +81,10 @@ def difficulty(
             say(f"{len(chosen)} of {len(records)} tasks: {out}")
 
 
-def _results(
+def script_results(
     dataset: Dataset, records: Sequence[TaskRecord], training: Dataset, jobs: int | None
 ) -> ScriptResults:
+    """Execute the plans of scripts that learned from ``training`` on these records."""
     if not records:
         return {}
     plans = write_plans(dataset, records, training)

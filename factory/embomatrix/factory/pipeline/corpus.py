@@ -1,12 +1,12 @@
-"""Corpus: training tasks in 45 scenes, and Internal-Verified, held-out tasks that are frozen under a digest.
+"""Corpus: training tasks in 45 scenes, held-out tasks, and Internal-Verified 2, the hardest of them, frozen under a digest.
 
 Two builds share one seed, which splits needs, words, jobs, kinds and goal shapes, so what one build holds out the other
-holds out too. More than half of Internal-Verified lies in six scenes that are in no training build.
+holds out too. More than half of the held-out tasks lie in six scenes that are in no training build.
 """
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -15,6 +15,7 @@ from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord, encode_records, write_dataset
+from embomatrix.world.difficulty import DifficultyLevel
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
@@ -29,8 +30,9 @@ HELDOUT_SCENES: Final = (
 """Three homes, a restaurant, an office and a school. Each kind of place keeps enough other scenes for training."""
 TRAIN: Final = "train"
 UNSEEN: Final = "unseen"
-VERIFIED: Final = "internal-verified"
-"""Folders of a corpus: training build, build in unseen scenes, and the frozen tasks."""
+HELDOUT: Final = "heldout"
+VERIFIED: Final = "internal-verified-2"
+"""Folders of a corpus: training build, build in unseen scenes, the held-out tasks of both, and the frozen ones."""
 FROZEN_FILE: Final = "frozen.json"
 UNSEEN_SHARE: Final = 0.6
 """Share of the held-out tasks in scenes that training never sees."""
@@ -40,11 +42,13 @@ UNSEEN_SHARE: Final = 0.6
 class CorpusSettings:
     """Settings of a corpus.
 
-    ``scenes`` are those of training, ``unseen`` those of the second build. Equal settings give equal corpora.
+    ``scenes`` are those of training, ``unseen`` those of the second build. ``verified`` is the number of frozen tasks. Equal
+    settings give equal corpora.
     """
 
     train: int = 2_000
-    heldout: int = 100
+    heldout: int = 200
+    verified: int = 100
     seed: int = 0
     scenes: tuple[str, ...] = ()
     unseen: tuple[str, ...] = HELDOUT_SCENES
@@ -64,7 +68,7 @@ class CorpusSettings:
 
 @dataclass(frozen=True, slots=True)
 class Frozen:
-    """Contents of Internal-Verified. ``digest`` covers the records, which name their bundles by digest."""
+    """Contents of Internal-Verified 2. ``digest`` covers the records, which name their bundles by digest."""
 
     tasks: int
     unseen: int
@@ -77,22 +81,51 @@ def training_scenes() -> tuple[str, ...]:
     return tuple(scene for scene in Catalog.load().scene_ids if scene not in HELDOUT_SCENES)
 
 
-def freeze(folder: Path) -> Frozen:
-    """Combine the held-out tasks of both builds and write their digest. Raise DatasetError."""
+def gather_heldout(folder: Path) -> Dataset:
+    """Write the held-out tasks of both builds into one folder and return it. Raise DatasetError if training shares any."""
     builds = [Dataset.load(folder / name) for name in (TRAIN, UNSEEN)]
-    train = builds[0].train
     records = [record for build in builds for record in build.heldout]
-    _check_apart(train, records)
+    _check_apart(builds[0].train, records)
     bundles = {
         record.bundle_digest: build.bundle_bytes(record.bundle_digest)
         for build in builds
         for record in build.heldout
     }
+    write_dataset(folder / HELDOUT, records, bundles)
+    return Dataset.load(folder / HELDOUT)
+
+
+def freeze(folder: Path, measured: Sequence[TaskRecord], count: int) -> Frozen:
+    """Freeze the hardest ``count`` held-out tasks, most of them in unseen scenes. Raise DatasetError.
+
+    ``measured`` are the records of ``gather_heldout`` with their difficulty.
+    """
+    heldout = Dataset.load(folder / HELDOUT)
+    train = Dataset.load(folder / TRAIN).train
+    trained_in = {base_scene_of(record.task.scene_id) for record in train}
+    records = _hardest(measured, trained_in, count)
+    _check_apart(train, records)
     target = folder / VERIFIED
-    write_dataset(target, records, bundles)
-    frozen = _frozen(target, {base_scene_of(record.task.scene_id) for record in train})
+    digests = dict.fromkeys(record.bundle_digest for record in records)
+    write_dataset(target, records, {digest: heldout.bundle_bytes(digest) for digest in digests})
+    frozen = _frozen(target, trained_in)
     write_whole(target / FROZEN_FILE, (json.dumps(asdict(frozen), indent=1) + "\n").encode("ascii"))
     return frozen
+
+
+def _hardest(records: Sequence[TaskRecord], trained_in: Collection[str], count: int) -> list[TaskRecord]:
+    """Return the hardest records of unseen scenes and of others, in their order. The task id decides between equals."""
+
+    def rank(record: TaskRecord) -> tuple[int, bytes]:
+        level = DifficultyLevel.EASY if record.difficulty is None else record.difficulty.level
+        return -list(DifficultyLevel).index(level), hashlib.sha256(record.task.task_id.encode()).digest()
+
+    ordered = sorted(records, key=rank)
+    unseen = [record for record in ordered if base_scene_of(record.task.scene_id) not in trained_in]
+    seen = [record for record in ordered if base_scene_of(record.task.scene_id) in trained_in]
+    away = max(min(len(unseen), round(count * UNSEEN_SHARE)), count - len(seen))
+    chosen = {record.task.task_id for record in (*unseen[:away], *seen[: count - away])}
+    return [record for record in records if record.task.task_id in chosen]
 
 
 def check_frozen(folder: Path) -> Frozen:
