@@ -168,8 +168,8 @@ def test_a_dataset_of_days_is_complete_and_resumes(tmp_path: Path) -> None:
     )
     build_dataset(tmp_path / "one", settings, making=DAYS)
     dataset = Dataset.load(tmp_path / "one")
-    wanted = (TaskCategory.PICK_AND_PLACE, TaskCategory.APPLIANCE_USE)
-    assert Counter(record.task.category for record in dataset.train) == dict.fromkeys(wanted, 1)
+    counts = Counter(record.task.category for record in dataset.train)
+    assert (counts.total(), max(counts.values())) == (2, 1)  # a third of two tasks, rounded up
     log = (tmp_path / "one" / "build.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
     (tmp_path / "two" / "bundles").mkdir(parents=True)
     for file in (tmp_path / "one" / "bundles").iterdir():

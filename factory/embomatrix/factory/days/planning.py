@@ -48,7 +48,7 @@ RARE: Final = frozenset(
         WishPredicate.SOAKED,
     }
 )
-RARE_WEIGHT: Final = 4.0
+RARE_WEIGHT: Final = 3.0
 """Weight of needs with a predicate that few needs have, so that each skill is needed by one task in twenty."""
 FAVOUR: Final = 3.0
 """Weight of needs whose category is missing most, or which belong to the held-out split, relative to others."""
