@@ -181,11 +181,11 @@ def test_benchmark_writes_no_file_unless_asked(dataset, workload, tmp_path, monk
     assert os.listdir(tmp_path) == []
 
 
-def test_folder_without_a_dataset_is_refused_with_the_build_command(tmp_path):
+def test_folder_without_a_dataset_is_refused_with_a_remedy(tmp_path):
     result = _bench("engine", f"--dataset={tmp_path}")
     assert result.exit_code == 2
     assert "there is no dataset in" in result.stderr
-    assert "embomatrix factory build" in result.stderr
+    assert "embomatrix factory starter" in result.stderr
 
 
 def test_too_few_scenes_for_a_workload_are_refused(dataset, tmp_path):

@@ -136,7 +136,7 @@ def _bundle(folder):
 
 
 DAMAGES = {
-    "no folder": (shutil.rmtree, "build one with `embomatrix factory build --out="),
+    "no folder": (shutil.rmtree, "get the shipped one with `embomatrix factory starter --out="),
     "no records": (lambda folder: (folder / "tasks.jsonl").unlink(), "tasks.jsonl can't be read"),
     "records cut": (lambda folder: _cut(folder / "tasks.jsonl"), "tasks.jsonl:1 is damaged: expected a JSON"),
     "records binary": (
@@ -166,7 +166,7 @@ def test_trainer_reports_the_same_dataset_errors(kitchen, tmp_path, damage):
     shutil.copytree(kitchen, folder)
     DAMAGES[damage][0](folder)
     result = run("train", f"--dataset={folder}", f"--manager={NOWHERE}", f"--out={tmp_path / 'out'}")
-    assert_ended(result, 2, "embomatrix train:", str(folder), "embomatrix factory build")
+    assert_ended(result, 2, "embomatrix train:", str(folder), "embomatrix factory starter")
 
 
 @pytest.mark.parametrize(

@@ -244,7 +244,7 @@ COMMANDS = (
         "missing dataset",
         "play apple_to_counter --oracle --dataset=FILES/nothing",
         "FILES/nothing",
-        "build one with `embomatrix factory build",
+        "get the shipped one with `embomatrix factory starter",
     ),
     CommandCase(
         "cut records",
@@ -274,7 +274,7 @@ COMMANDS = (
         "training on a missing dataset",
         "train --dataset=FILES/nothing --out=FILES/new --manager=NOWHERE",
         "FILES/nothing",
-        "build one with `embomatrix factory build",
+        "get the shipped one with `embomatrix factory starter",
     ),
     CommandCase(
         "unreadable plan file",

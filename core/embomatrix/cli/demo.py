@@ -11,13 +11,12 @@ import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
-from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, no_problem, run_command
+from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, run_command
 from embomatrix.host.failure import fail
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
+from embomatrix.world.starter import unpack
 
 DEFAULT_OUT: Final = Path("runs/demo")
-TASKS: Final = 960
-"""Training tasks. With half as many, the policy memorises the plans before it learns to read prompts."""
-HELDOUT: Final = 120
 IMITATION_STEPS: Final = 340
 GRPO_STEPS: Final = 420
 """Budgets in steps: the same seed gives the same curve on a fast machine and on a slow one."""
@@ -29,9 +28,9 @@ def demo(
         Path | None,
         typer.Option(help=f"Output folder. Default: {DEFAULT_OUT}, or the first free {DEFAULT_OUT}-2, -3 …"),
     ] = None,
-    dataset: Annotated[Path, typer.Option(help="Dataset folder. It is built if missing.")] = Path(
-        "build/dataset"
-    ),
+    dataset: Annotated[
+        Path, typer.Option(help="Dataset folder. If it is missing, the shipped tasks are unpacked there.")
+    ] = Path("build/dataset"),
     workers: Annotated[int, typer.Option(min=1, max=64, help="Workers on this machine.")] = 2,
     slots: Annotated[int, typer.Option(min=1, max=64, help="Slots per worker.")] = 1,
     steps: Annotated[int, typer.Option(min=0, help="Steps of GRPO.")] = GRPO_STEPS,
@@ -39,7 +38,7 @@ def demo(
         int, typer.Option(min=0, help="Steps of imitation before GRPO.")
     ] = IMITATION_STEPS,
     model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
-    seed: Annotated[int, typer.Option(help="Random seed of tasks, policy and sampling.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of policy and sampling.")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")] = 0,
 ) -> None:
     """Start a local cluster and train on real tasks, from nothing to a report."""
@@ -48,7 +47,7 @@ def demo(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     folder = _folder(out)
     started_s = time.monotonic()
-    _ensure_tasks(dataset, seed)
+    _ensure_tasks(dataset)
     built_s = time.monotonic()
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=dataset)
     with cluster.supervisor:
@@ -71,25 +70,22 @@ def demo(
     )
 
 
-def _ensure_tasks(dataset: Path, seed: int) -> None:
-    """Build the dataset if it is missing."""
-    if (dataset / "tasks.jsonl").exists():
-        console.print(
-            f"tasks of {dataset}, which was built before; another --dataset makes new ones", highlight=False
-        )
+def _ensure_tasks(dataset: Path) -> None:
+    """Unpack the shipped dataset if there is none."""
+    if (dataset / TASKS_FILE).exists():
+        console.print(f"tasks of {dataset}, which was there before", highlight=False)
         return
     console.rule("tasks")
-    # Skip the reachability check for physical mode, which a demo does not need.
-    where = [f"--out={dataset}", f"--seed={seed}"]
-    run_command(
-        "demo",
-        no_problem,
-        "factory",
-        "build",
-        *where,
-        f"--train={TASKS}",
-        f"--heldout={HELDOUT}",
-        "--no-look-ahead",
+    try:
+        unpack(dataset)
+    except (DatasetError, OSError) as error:
+        fail("demo", f"the tasks can't be unpacked to {dataset}: {error}")
+    tasks = Dataset.load(dataset)
+    scenes = {record.task.scene_id.partition("-")[0] for record in tasks.records}
+    console.print(
+        f"{len(tasks.train)} training tasks and {len(tasks.heldout)} held-out tasks in {len(scenes)} scenes, which ship with "
+        "the package; `embomatrix factory generate` makes others",
+        highlight=False,
     )
 
 

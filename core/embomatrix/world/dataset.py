@@ -31,7 +31,7 @@ BUNDLES_FOLDER: Final = "bundles"
 SPLITS: Final = ("train", "heldout")
 MAX_PLAN_STEPS: Final = 1_000
 """Steps of an oracle's plan in a measured difficulty."""
-_REMEDY: Final = "copy the dataset again, or build one with `embomatrix factory build`"
+_REMEDY: Final = "copy the dataset again, or get the shipped one with `embomatrix factory starter`"
 
 
 class DatasetError(ValueError):
@@ -77,7 +77,7 @@ class Dataset:
         except OSError as error:
             raise DatasetError(
                 f"there is no dataset in {folder}: {path} can't be read ({error.strerror}); "
-                f"build one with `embomatrix factory build --out={folder}`, or name another folder with --dataset"
+                f"get the shipped one with `embomatrix factory starter --out={folder}`, or name another folder with --dataset"
             ) from error
         except UnicodeDecodeError as error:
             raise DatasetError(

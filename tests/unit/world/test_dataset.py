@@ -47,7 +47,7 @@ def test_unknown_task_suggests_a_close_name(tmp_path: Path, bundle: Bundle, task
 
 
 def test_folder_without_a_dataset_suggests_the_build_command(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="factory build"):
+    with pytest.raises(DatasetError, match="factory starter"):
         Dataset.load(tmp_path / "nothing")
 
 

@@ -88,7 +88,7 @@ _Arm = Annotated[
     typer.Option(metavar="NAME:KEY=VALUE,...", help="Settings of an arm; NAME alone: defaults. Repeatable."),
 ]
 _Out = Annotated[Path | None, typer.Option(help="Folder of all runs; the same command resumes them.")]
-_Dataset = Annotated[Path, typer.Option(help="Folder that `embomatrix factory build` wrote.")]
+_Dataset = Annotated[Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter`.")]
 _Title = Annotated[str, typer.Option(help="Heading of the section.")]
 _Seeds = Annotated[
     list[int] | None,

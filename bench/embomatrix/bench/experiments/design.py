@@ -69,7 +69,7 @@ def dataset_digest(dataset: Path) -> str:
     tasks = dataset / "tasks.jsonl"
     if not tasks.is_file():
         raise TrainerError(
-            f"no dataset at {dataset}: build one with `embomatrix factory build --out={dataset}`"
+            f"no dataset at {dataset}: get the shipped one with `embomatrix factory starter --out={dataset}`"
         )
     return hashlib.sha256(tasks.read_bytes()).hexdigest()[:12]
 

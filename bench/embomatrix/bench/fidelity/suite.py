@@ -106,7 +106,7 @@ def examples_of(dataset: Dataset) -> dict[str, list[SolvedTask]]:
         found.setdefault(record.bundle_digest, []).append(_example(record))
     if not found:
         raise BenchError(
-            f"the dataset in {dataset.folder} has no tasks: build one with 'embomatrix factory build'"
+            f"the dataset in {dataset.folder} has no tasks: get the shipped one with `embomatrix factory starter`"
         )
     return found
 

@@ -31,6 +31,7 @@ from embomatrix.factory.commands.language_model import (
 from embomatrix.factory.commands.layout import lay
 from embomatrix.factory.commands.merge import merge
 from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics
+from embomatrix.factory.commands.starter import starter
 from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
 from embomatrix.factory.commands.verification import verify
@@ -52,7 +53,7 @@ from embomatrix.world.whole_file import write_whole
 app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
-for command in (agent, lay, inspect, pictures, corpus, merge, verify, audit, evaluate, difficulty):
+for command in (agent, lay, inspect, pictures, corpus, starter, merge, verify, audit, evaluate, difficulty):
     app.command()(command)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]

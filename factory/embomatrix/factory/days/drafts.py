@@ -128,7 +128,7 @@ class DraftWriter:
         """
         conditions, members, about = self._joined(combination)
         task = task_of(task_id, self._view, conditions, members, about)
-        while (unclear := self._unclear(task, members)) is not None:
+        while _is_whole(task, members) and (unclear := self._unclear(task, members)) is not None:
             alike = self._alike(members[unclear])
             about_doors = any(
                 each.things == unclear and each.predicate is WishPredicate.OPEN for each in conditions
@@ -140,7 +140,7 @@ class DraftWriter:
             conditions = [_of_any(each) if members[each.things] == alike else each for each in conditions]
             about = tuple(dict.fromkeys((*about, *alike)))
             task = task_of(task_id, self._view, conditions, members, about)
-        if len(task.table) > MAX_ROWS:
+        if len(task.table) > MAX_ROWS or not _is_whole(task, members):
             return None
         told = self._told(task, combination, conditions, members)
         if told is None:
@@ -210,6 +210,12 @@ class DraftWriter:
             )
         except UndescribableError:
             return None
+
+
+def _is_whole(task: Task, members: Members) -> bool:
+    """True if the table holds all objects of the conditions; long tables are cut."""
+    rows = set(task.table)
+    return all(name in rows for names in members.values() for name in names)
 
 
 def task_of(

@@ -40,7 +40,7 @@ BEFORE_SHARE: Final = 0.35
 SAME_SHARE: Final = 0.6
 """Share of requests that only refer to the one before, if they ask for the same of other things."""
 _TAKES_NO_JOINT: Final = re.compile(
-    r"(In the end|When you|The same|And |Do the same|Likewise|Nobody has|Why |There is one|How about)"
+    r"(In the end|When you|The same|And |Do the same|Likewise|Nobody has|Why |Here is what|How about)"
     r"|.*( (is|are) still | can't stay | now and should be |too, please\.$|\?$)"
 )
 """Sentences that read badly after *first* or *finally*."""
