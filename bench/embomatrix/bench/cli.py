@@ -239,7 +239,9 @@ def fidelity(
 
 @app.command()
 def workload(
-    dataset: Annotated[Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter`.")],
+    dataset: Annotated[
+        Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter`.")
+    ],
     out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: the dataset's]")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds and datasets give equal files.")] = 0,
     bodies: Annotated[

@@ -141,7 +141,7 @@ def evaluate(
     bench: Annotated[
         str,
         _option(
-            _BENCH, help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."
+            _BENCH, help="eai-native, eai, internal-verified-2, a dataset folder, or a file of task records."
         ),
     ] = "",
     split: Annotated[

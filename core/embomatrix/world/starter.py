@@ -83,7 +83,7 @@ def pack(dataset: Dataset, file: Path) -> str:
 
 
 def unpack(folder: Path, file: Path | None = None) -> str:
-    """Write the shipped dataset, or that of a file, into a folder. Return its content digest. Raises DatasetError or OSError."""
+    """Write the shipped dataset, or that of a file, to a folder. Return its content digest. Raises DatasetError or OSError."""
     if file is not None:
         return _unpacked(folder, file)
     with resources.as_file(resources.files("embomatrix.world") / "data" / ARCHIVE) as shipped:

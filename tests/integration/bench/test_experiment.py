@@ -230,7 +230,7 @@ def test_outcome_survives_a_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("learning", "--dataset=nowhere"), "no dataset at nowhere: build one"),
+        (("learning", "--dataset=nowhere"), "no dataset at nowhere: get the shipped one"),
         (("compare", "--arm=Fast:a=1", "--dataset=DS"), "has the name 'Fast': expected small letters"),
         (("compare", "--arm=a:grpo.speed=1", "--dataset=DS"), "unknown setting 'grpo.speed'"),
         (("learning", "--set=grpo.group=1", "--dataset=DS"), "setting 'grpo.group'"),

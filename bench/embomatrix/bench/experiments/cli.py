@@ -179,7 +179,7 @@ def table(
     run: Annotated[Path, typer.Option(help="Folder of a finished run of `embomatrix train`.")],
     bench: Annotated[
         list[str],
-        typer.Option(help="Benchmark of `embomatrix eval --bench`: a dataset, internal-verified, eai."),
+        typer.Option(help="Benchmark of `embomatrix eval --bench`: a dataset, internal-verified-2, eai."),
     ],
     samples: Annotated[int, typer.Option(min=1, max=1000, help="Plans of each task.")] = 10,
     manager: _Manager = "",

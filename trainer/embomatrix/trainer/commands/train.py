@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 Connect = Callable[[], ClusterClient]
 
-_DATASET = Annotated[Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter` or `generate`.")]
+_DATASET = Annotated[
+    Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter` or `generate`.")
+]
 _LOG_FORMAT = Annotated[
     LogFormat | None,
     typer.Option(

@@ -18,11 +18,12 @@ from embomatrix.world.task import Profile
 ALL: Final = "all"
 IMPORT_REPORT: Final = "import.json"
 """Report of `embomatrix factory import --report` in the dataset's folder. Rejected problems count as failed."""
-NAMED: Final[Mapping[str, str]] = {
-    "internal-verified": "embomatrix factory",
-    "eai": "embomatrix factory import",
+NAMED: Final[Mapping[str, tuple[Path, str]]] = {
+    "internal-verified-2": (Path("build/corpus/internal-verified-2"), "embomatrix factory corpus"),
+    "internal-verified": (Path("build/internal-verified"), "embomatrix factory"),
+    "eai": (Path("build/eai"), "embomatrix factory import"),
 }
-"""Benchmarks in folders of their names below ``build``, and the commands that create them."""
+"""Benchmarks with the folders of their names, and the commands that create them."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,11 @@ def find_benchmark(
     takes the first tasks only. With the profile ``PAPER``, tasks that need another household skill fail by rule. Raises
     TrainerError.
     """
-    path = Path("build", named) if named in NAMED else Path(named)
+    path = NAMED[named][0] if named in NAMED else Path(named)
     if not path.exists():
         remedy = f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join(NAMED)}"
         if named in NAMED:
-            remedy = f"create it with `{NAMED[named]}`, or pass its folder"
+            remedy = f"create it with `{NAMED[named][1]}`, or pass its folder"
         raise TrainerError(f"no benchmark at {path}: {remedy}")
     folder = path if path.is_dir() else path.parent
     records = _read_records(path)
