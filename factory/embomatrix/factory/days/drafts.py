@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -34,6 +34,8 @@ NEEDS_OF_TASK: Final = (1, 1, 1, 2, 2, 3)
 """Numbers of needs of one event that a task joins; each entry is equally likely."""
 NEEDS_OF_LONG_TASK: Final = (3, 4, 5, 6)
 """Numbers of needs of one person that a long task joins, which may belong to several events."""
+LONG_SHARE: Final = 0.4
+"""Share of people, among those with enough needs, who ask for a long task."""
 MAX_HOURS_APART: Final = 4
 """Maximum time between the events of a long task."""
 MAX_ROWS: Final = 40
@@ -66,39 +68,36 @@ class Combination:
 
 
 def combinations_of(day: DayScene, rng: np.random.Generator) -> list[Combination]:
-    """Return the needs of the day in groups of one event, then a long group of each person with enough needs.
-
-    Each need belongs to one group of its event, and may belong to a long group besides.
-    """
+    """Return the needs of the day in groups: a long one of some of the people, the others by event. No need is in two."""
     found: list[Combination] = []
     by_event: dict[str, list[int]] = {}
+    joined = _long_groups(day, rng)
     for number, need in enumerate(day.needs):
-        by_event.setdefault(need.event.name, []).append(number)
+        if not any(number in group for group in joined):
+            by_event.setdefault(need.event.name, []).append(number)
     for numbers in by_event.values():
         left = [numbers[int(at)] for at in rng.permutation(len(numbers))]
         while left:
             size = min(len(left), NEEDS_OF_TASK[int(rng.integers(len(NEEDS_OF_TASK)))])
             chosen, left = left[:size], left[size:]
             found.append(_combination(day, chosen))
-    return [*found, *_long_combinations(day, [each.needs for each in found], rng)]
+    return [*found, *(_combination(day, group) for group in joined)]
 
 
-def _long_combinations(
-    day: DayScene, known: Collection[tuple[NeedOfDay, ...]], rng: np.random.Generator
-) -> Iterator[Combination]:
+def _long_groups(day: DayScene, rng: np.random.Generator) -> list[list[int]]:
+    """Return the positions of the needs of each long task, by the hour of their events."""
     by_person: dict[str, list[int]] = {}
     for number, need in enumerate(day.needs):
         by_person.setdefault(need.person.name, []).append(number)
+    found = []
     for numbers in by_person.values():
         order = [numbers[int(at)] for at in rng.permutation(len(numbers))]
         size = NEEDS_OF_LONG_TASK[int(rng.integers(len(NEEDS_OF_LONG_TASK)))]
         hour = day.needs[order[0]].hour
         near = [at for at in order if abs(day.needs[at].hour - hour) <= MAX_HOURS_APART / 2][:size]
-        joined = _combination(
-            day, sorted(near, key=lambda at: (day.needs[at].hour, day.needs[at].event.name))
-        )
-        if len(near) >= NEEDS_OF_LONG_TASK[0] and joined.needs not in known:
-            yield joined
+        if rng.random() < LONG_SHARE and len(near) >= NEEDS_OF_LONG_TASK[0]:
+            found.append(sorted(near, key=lambda at: (day.needs[at].hour, day.needs[at].event.name)))
+    return found
 
 
 def _combination(day: DayScene, chosen: Sequence[int]) -> Combination:
@@ -127,6 +126,8 @@ class DraftWriter:
         Words that fit several equal pieces of furniture mean any of them, and so does the goal.
         """
         conditions, members, about = self._joined(combination)
+        if not _pairs_have_types(conditions, _types(self._view, conditions, members)):
+            return None
         task = task_of(task_id, self._view, conditions, members, about)
         while _is_whole(task, members) and (unclear := self._unclear(task, members)) is not None:
             alike = self._alike(members[unclear])
@@ -210,6 +211,13 @@ class DraftWriter:
             )
         except UndescribableError:
             return None
+
+
+def _pairs_have_types(conditions: Sequence[Condition], types: Mapping[str, str]) -> bool:
+    """True if each condition on pairs ranges over types of its own. Other groups of one kind can be written out."""
+    return all(
+        label in types for each in conditions if each.quantity in PAIRS for label in (each.things, each.place)
+    )
 
 
 def _is_whole(task: Task, members: Members) -> bool:

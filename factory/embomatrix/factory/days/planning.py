@@ -32,7 +32,7 @@ from embomatrix.world.poses import PoseCache
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
 
-NEEDS_OF_DAY: Final = 12
+NEEDS_OF_DAY: Final = 16
 """Maximum number of needs of one day."""
 NEEDS_OF_EVENT: Final = 4
 HELD_OUT_SHAPES: Final = 5

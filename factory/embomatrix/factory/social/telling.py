@@ -35,7 +35,7 @@ PRONOUN_SHARE: Final = 0.8
 WHENCE_SHARE: Final = 0.6
 TOGETHER_SHARE: Final = 0.6
 """Share of requests with the same place that are told in one clause."""
-BEFORE_SHARE: Final = 0.35
+BEFORE_SHARE: Final = 0.2
 """Share of instructions that say by when, if the event has words for it."""
 SAME_SHARE: Final = 0.6
 """Share of requests that only refer to the one before, if they ask for the same of other things."""
