@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import asdict, replace
@@ -21,7 +22,7 @@ from embomatrix.factory.evaluate.density import density_figures, homes
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.lies import evaluate_lies
 from embomatrix.factory.evaluate.page import with_factory
-from embomatrix.factory.evaluate.readings import evaluate_readings, read_answers
+from embomatrix.factory.evaluate.readings import evaluate_readings, read_answers, shipped_answers
 from embomatrix.factory.evaluate.scenes import (
     LayoutMethod,
     PoseSource,
@@ -39,6 +40,7 @@ from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
+from embomatrix.world.starter import unpack
 from embomatrix.world.whole_file import write_whole
 
 METHODS = list(LayoutMethod)
@@ -56,12 +58,13 @@ def evaluate(
     dataset: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset for tasks, scripts, skills, readings and admission. Default for tasks: draft tasks with both writers."
+            help="Dataset for tasks, scripts, skills, readings and admission. Default for tasks: drafts of both writers; for "
+            "scripts, skills and readings: the shipped dataset."
         ),
     ] = None,
     training: Annotated[
         Path | None,
-        typer.Option(help="Dataset whose training tasks the scripts learn from. Default: that of --dataset."),
+        typer.Option(help="Dataset whose training tasks the scripts learn from. Default: the same dataset."),
     ] = None,
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
     sample: Annotated[
@@ -78,7 +81,9 @@ def evaluate(
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes for scenes, scripts and skills.")] = 1,
     answers: Annotated[
         Path | None,
-        typer.Option(help="JSON lines file with the answers of a reader of prompts, for readings."),
+        typer.Option(
+            help="JSON lines file with the answers of a reader of prompts, for readings. Default: the shipped ones."
+        ),
     ] = None,
     poses: Annotated[
         Path | None,
@@ -107,23 +112,25 @@ def evaluate(
 
     A language model judges looks, and also tasks if one is given.
     """
+    kept = tempfile.TemporaryDirectory()
+    scratch = Path(kept.name)
     judge = partial(chat_model, llm, model, key, cassette)
     writer = PoseSource(poses, llm, model, key) if poses is not None else PoseSource()
     measures: Mapping[str, Callable[[], EvaluationFigures]] = {
         "tasks": lambda: _tasks(dataset, each, seed, judge() if llm or cassette else None),
         "scripts": lambda: evaluate_scripts(
-            _given(dataset, "--dataset FOLDER"), training, jobs=jobs, counter=counter
+            dataset or _shipped(scratch), training, jobs=jobs, counter=counter
         ),
         "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes, writer),
         "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed, writer)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
         "lies": evaluate_lies,
-        "readings": lambda: _readings(_given(dataset, "--dataset FOLDER"), _given(answers, "--answers FILE")),
-        "skills": lambda: _skills(_given(dataset, "--dataset FOLDER"), only, jobs),
+        "readings": lambda: _readings(dataset or _shipped(scratch), answers),
+        "skills": lambda: _skills(dataset or _shipped(scratch), only, jobs),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
     check_output(page)
-    with user_errors(more=MODEL_ERRORS):
+    with user_errors(more=MODEL_ERRORS), kept:
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")
         for part in parts:
@@ -151,9 +158,18 @@ def _given(path: Path | None, option: str) -> Path:
     return path
 
 
-def _readings(dataset: Path, answers: Path) -> EvaluationFigures:
-    """Judge the answers of a reader, and print those that failed."""
-    evaluation, verdicts = evaluate_readings(Dataset.load(dataset), read_answers(answers))
+def _shipped(scratch: Path) -> Path:
+    """Return the folder of the shipped dataset, which is unpacked there first."""
+    folder = scratch / "shipped"
+    if not folder.exists():
+        unpack(folder)
+    return folder
+
+
+def _readings(dataset: Path, answers: Path | None) -> EvaluationFigures:
+    """Judge the answers of a reader, by default the shipped ones, and print those that failed."""
+    readings = shipped_answers() if answers is None else read_answers(answers)
+    evaluation, verdicts = evaluate_readings(Dataset.load(dataset), readings)
     for verdict in verdicts:
         if verdict.success is False or verdict.agrees is False:
             say(f"{verdict.task}: {verdict.detail}")

@@ -11,6 +11,7 @@ import contextlib
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import resources
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +32,7 @@ from embomatrix.world.goal import And, Atom, Formula, Imply, Not, Or, Quantified
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.task import Task
 
+ANSWERS: Final = "readings.jsonl"
 EXACTLY: Final = "exactly"
 MAX_ATOMS: Final = 12
 """Maximum number of atoms for which all assignments are compared; with more, a sample is."""
@@ -77,6 +79,12 @@ def read_answers(path: Path) -> tuple[Reading, ...]:
                 f"{path}:{number} is no answer ({error}): expected an object with task, plan and goal"
             ) from error
     return tuple(found)
+
+
+def shipped_answers() -> tuple[Reading, ...]:
+    """Return the answers of readers about held-out tasks of the shipped dataset."""
+    with resources.as_file(resources.files("embomatrix.factory.evaluate") / ANSWERS) as file:
+        return read_answers(file)
 
 
 def prompts_of(dataset: Dataset, count: int) -> str:

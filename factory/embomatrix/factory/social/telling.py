@@ -84,7 +84,7 @@ class Teller:
     voice: Voice
 
     def instruction(self, asked: Sequence[Asked]) -> str:
-        """Return the instruction for needs of one event. Raise UndescribableError."""
+        """Return the instruction for needs of one person. Raise UndescribableError."""
         first = asked[0].need
         speaker = Speaker() if self._rng() < FIRST_PERSON_SHARE else Speaker(first.person.name)
         greeting = "" if speaker.name else self.voice.choose(_GREETINGS).format(name=first.person.name)
