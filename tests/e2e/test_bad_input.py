@@ -147,7 +147,10 @@ DAMAGES = {
         lambda folder: _cut(_bundle(folder)),
         "of the dataset is damaged (the bundle's digest is sha256:",
     ),
-    "no bundle": (lambda folder: _bundle(folder).unlink(), "copy the dataset again, or get the shipped one with"),
+    "no bundle": (
+        lambda folder: _bundle(folder).unlink(),
+        "copy the dataset again, or get the shipped one with",
+    ),
 }
 
 

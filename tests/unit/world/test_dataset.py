@@ -79,7 +79,9 @@ def test_missing_and_damaged_bundles_are_named(tmp_path: Path, bundle: Bundle, t
     with pytest.raises(DatasetError, match=r"can't be read \(it has over 8,388,608 bytes\)"):
         Dataset.load(tmp_path).bundle(record.bundle_digest)
     file.unlink()
-    with pytest.raises(DatasetError, match=r"can't be read.*: copy the dataset again, or get the shipped one"):
+    with pytest.raises(
+        DatasetError, match=r"can't be read.*: copy the dataset again, or get the shipped one"
+    ):
         Dataset.load(tmp_path).bundle(record.bundle_digest)
 
 
