@@ -95,7 +95,7 @@ OWN: Final[Mapping[str, str]] = {
     "factory.commands.evaluate:_shipped": PACKAGED,
     "factory.commands.starter:starter": PACKAGED,
     "world.catalog:_read": PACKAGED,
-    "world.starter:_unpacked": PACKAGED,
+    "starter.archive:_unpacked": PACKAGED,
     "world.substances:_table": PACKAGED,
     "sim.zygote:frame_lengths": CHILD,
     "sim.zygote:receive": CHILD,

@@ -13,8 +13,8 @@ from rich.logging import RichHandler
 
 from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, run_command
 from embomatrix.host.failure import fail
+from embomatrix.starter.archive import unpack
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
-from embomatrix.world.starter import unpack
 
 DEFAULT_OUT: Final = Path("runs/demo")
 IMITATION_STEPS: Final = 340

@@ -39,8 +39,8 @@ from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.starter.archive import unpack
 from embomatrix.world.dataset import Dataset
-from embomatrix.world.starter import unpack
 from embomatrix.world.whole_file import write_whole
 
 METHODS = list(LayoutMethod)

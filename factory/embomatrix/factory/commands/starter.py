@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from embomatrix.factory.commands.terminal import say, user_errors
+from embomatrix.starter.archive import unpack
 from embomatrix.world.dataset import Dataset
-from embomatrix.world.starter import unpack
 
 
 def starter(

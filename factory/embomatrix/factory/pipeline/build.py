@@ -321,7 +321,7 @@ class _SplitOrders:
     def _missing(self, before: int) -> dict[TaskCategory, int]:
         """Return the number of tasks of each category that may be added before this variant."""
         done = Counter(record.task.category for record in self._before(before))
-        left = max(0, self._target - done.total())
+        left = self._left(before)
         return {
             category: min(left, max(0, quota - done[category])) for category, quota in self._quota.items()
         }

@@ -17,7 +17,7 @@ from typing import Any, Final
 from embomatrix.world.dataset import Dataset, DatasetError, record_from_json, record_to_json, write_dataset
 from embomatrix.world.inflation import DEFAULT_LIMITS, bundle_digest, decompress
 
-ARCHIVE: Final = "starter.xz"
+ARCHIVE: Final = "tasks.xz"
 LEVEL: Final = 6
 """Level of compression of the unpacked bundles, that of ``encode_bundle``."""
 _DICTIONARY_BYTES: Final = 1 << 26
@@ -51,7 +51,7 @@ def unpack(folder: Path, file: Path | None = None) -> str:
     """Write the shipped dataset, or that of a file, to a folder. Return its content digest. Raises DatasetError or OSError."""
     if file is not None:
         return _unpacked(folder, file)
-    with resources.as_file(resources.files("embomatrix.world") / "data" / ARCHIVE) as shipped:
+    with resources.as_file(resources.files("embomatrix.starter") / ARCHIVE) as shipped:
         return _unpacked(folder, shipped)
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 
-from embomatrix.world import starter
+from embomatrix.starter import archive
+from embomatrix.starter.archive import content_digest, pack, unpack
 from embomatrix.world.dataset import Dataset, DatasetError
-from embomatrix.world.starter import content_digest, pack, unpack
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_another_compression_changes_no_content(
     tmp_path: Path, kitchen: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     digest = pack(kitchen, tmp_path / "packed.xz")
-    monkeypatch.setattr(starter, "LEVEL", zlib.Z_BEST_SPEED)
+    monkeypatch.setattr(archive, "LEVEL", zlib.Z_BEST_SPEED)
     assert unpack(tmp_path / "again", tmp_path / "packed.xz") == digest
     again = Dataset.load(tmp_path / "again")
     assert {record.bundle_digest for record in again.records}.isdisjoint(
