@@ -15,12 +15,14 @@ from embomatrix.factory.writer.words import Voice
 FILE: Final = "phrases.toml"
 HELD_OUT_PHRASES: Final = 4
 """One in this many verbs, states and sentence forms belongs to the held-out split."""
+_LEAVES_CHOICE: Final = re.compile(r"(either|exactly|only|any|some|something|one|an?|all but)\b|\w+ of the\b")
+"""Words for objects that may be chosen, which have no single right place."""
 _PARTICIPLES: Final[Mapping[str, str]] = {
     "put": "put", "set": "set", "lay": "laid", "leave": "left", "bring": "brought", "stand": "stood", "get": "got",
     "drop": "dropped", "keep": "kept", "hide": "hidden", "take": "taken", "cut": "cut", "shut": "shut", "let": "left",
     "run": "run", "have": "had", "wet": "wetted", "freeze": "frozen", "pick": "picked", "light": "lit", "scrub": "scrubbed",
     "stop": "stopped", "free": "freed",
-    "transfer": "transferred",
+    "transfer": "transferred", "throw": "thrown", "slide": "slid",
 }  # fmt: skip
 """Past participles that do not end in a plain ``-ed``."""
 _NO_PASSIVE: Final = (
@@ -191,6 +193,8 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
         )
     state = _filled(voice.choose(book.states(clause.key)), fields)
     forms = book.forms(kind)
+    if _LEAVES_CHOICE.match(clause.thing.words):
+        forms = tuple(form for form in forms if not form.startswith("The right place")) or forms
     if _HAS_PLACE.search(clause.thing.words):
         # *I want the milk in the fridge on the table* misleads; a verb must part thing and place.
         forms = tuple(form for form in forms if "{x} {state}" not in form) or forms

@@ -12,7 +12,7 @@ EVERYDAY: Final[Mapping[str, str]] = {
     "bottom_cabinet_no_top": "base cabinet",
     "metal_bottom_cabinet": "low metal cabinet",
     "top_cabinet": "wall cabinet",
-    "furniture_sink": "cabinet sink",
+    "furniture_sink": "sink",
     "multi_station_furniture_sink": "long cabinet sink",
     "multi_station_tabletop_sink": "long sink",
     "multi_station_wall_mounted_sink": "long wash trough",
@@ -47,7 +47,7 @@ EVERYDAY: Final[Mapping[str, str]] = {
     "breakfast_table": "table",
     "commercial_kitchen_table_top": "worktop",
     "bunch_of_bananas": "bunch of bananas",
-    "dip_candle": "dipped candle",
+    "dip_candle": "dip candle",
     "cup_of_yogurt": "cup of yogurt",
     "baseball_cap": "baseball cap",
     "free_weight": "dumbbell",
@@ -122,9 +122,19 @@ def listed(items: Sequence[str], conjunction: str = "and") -> str:
     return str(_ENGINE.join(tuple(items), conj=conjunction, final_sep=""))
 
 
+_GERUNDS: Final[Mapping[str, str]] = {
+    "open": "opening",
+    "deposit": "depositing",
+    "transfer": "transferring",
+    "position": "positioning",
+    "soak": "soaking",
+}
+"""Verbs whose last consonant inflect doubles, or fails to double, wrongly."""
+
+
 def gerund(verb: str) -> str:
     """Return the ``-ing`` form of a verb."""
-    return str(_ENGINE.present_participle(verb))
+    return _GERUNDS.get(verb) or str(_ENGINE.present_participle(verb))
 
 
 def room_noun(room: str, rooms: Sequence[str]) -> str:

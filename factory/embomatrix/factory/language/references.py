@@ -163,7 +163,7 @@ class Describer:
         categories = frozenset(row.category for row in rows)
         heads: list[Description] = []
         if len(categories) == 1:
-            heads.append(Description(noun_of(rows[0].category), categories))
+            heads.append(self._head(rows[0].category))
         if kinds:
             heads += [
                 Description(kind.noun, kind.members, kind.name, kind.use)
@@ -178,6 +178,13 @@ class Describer:
                     found = dataclasses.replace(head, **changes)
                     if not found.room or f"in {room_noun(found.room, self.rooms)}" not in found.host_words:
                         yield found
+
+    def _head(self, category: str) -> Description:
+        """Return the noun of a category, which also fits objects with a longer noun: a coffee table is a table."""
+        noun = noun_of(category)
+        known = {row.category for row in self.rows.values()}
+        longer = {other for other in known if noun_of(other).one.endswith(f" {noun.one}")}
+        return Description(noun, frozenset({category, *longer}))
 
     def _restrictions(self, rows: Sequence[PromptRow]) -> Iterator[Mapping[str, Any]]:
         """Yield restrictions that hold of all rows: a state, a support, a room, contents."""
@@ -219,7 +226,7 @@ class Describer:
         row = self.rows.get(host)
         if row is None:
             return
-        head = Description(noun_of(row.category), frozenset({row.category}))
+        head = self._head(row.category)
         for each in (head, dataclasses.replace(head, room=row.room)):
             found = self.denoted(each)
             if len(found) == 1:

@@ -92,13 +92,13 @@ class Teller:
         is_named = bool(speaker.name) and speaker.name in why
         later = Speaker("She" if is_female(speaker.name) else "He") if is_named else speaker
         parts = [greeting + capitalised(why)]
-        for event, group in itertools.groupby(asked, key=lambda each: each.need.event):
-            needs = list(group)
-            if event is not first.event:
+        groups = [list(group) for _, group in itertools.groupby(asked, key=lambda each: each.need.event.name)]
+        for number, needs in enumerate(groups):
+            event = needs[0].need.event
+            if number:
                 parts.append(self._turn_to(needs[0].need, later))
-            parts.append(
-                self._joined([said for each in needs for said in self._requests(each, later)], speaker.name)
-            )
+            said = [said for each in needs for said in self._requests(each, later)]
+            parts.append(self._joined(said, speaker.name, ends=number == len(groups) - 1))
             if event.before and self._rng() < BEFORE_SHARE:
                 parts.append(
                     self._deadline(event, later, is_one=len(needs) == 1 and len(needs[0].conditions) == 1)
@@ -124,13 +124,13 @@ class Teller:
     def _rng(self) -> float:
         return float(self.voice.rng.random())
 
-    def _joined(self, said: Sequence[_Said], name: str) -> str:
-        """Return the sentences with joints before some of them. ``name`` is the speaker's."""
+    def _joined(self, said: Sequence[_Said], name: str, *, ends: bool) -> str:
+        """Return the sentences with joints before some of them. ``name`` is the speaker's. ``ends``: nothing follows."""
         told = []
         for number, (sentence, is_request) in enumerate(said):
             if name and number and sentence.startswith(f"{name} "):
                 sentence = f"{'She' if is_female(name) else 'He'}{sentence.removeprefix(name)}"
-            last = number == len(said) - 1
+            last = ends and number == len(said) - 1
             kind = "first" if not number else "last" if last else "next"
             takes_joint = is_request and len(said) > 1 and not _TAKES_NO_JOINT.match(sentence)
             joint = self.voice.choose(self.book.joints(kind)) if takes_joint else ""
@@ -253,6 +253,7 @@ class Teller:
         whence = ""
         if (
             first.quantity is Quantity.ALL
+            and first.otherwise is None
             and len({self._host(name) for name in names}) == 1
             and self._rng() < WHENCE_SHARE
         ):
