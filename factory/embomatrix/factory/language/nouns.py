@@ -12,7 +12,7 @@ EVERYDAY: Final[Mapping[str, str]] = {
     "bottom_cabinet_no_top": "base cabinet",
     "metal_bottom_cabinet": "low metal cabinet",
     "top_cabinet": "wall cabinet",
-    "furniture_sink": "sink",
+    "furniture_sink": "cabinet sink",
     "multi_station_furniture_sink": "long cabinet sink",
     "multi_station_tabletop_sink": "long sink",
     "multi_station_wall_mounted_sink": "long wash trough",
