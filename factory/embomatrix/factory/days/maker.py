@@ -80,7 +80,7 @@ class DayMaker:
 
 TASKS_PER_DAY: Final = 2
 """Number of tasks that a day should yield. With the analysis of the arm and the proof in physics, many needs drop out."""
-MOST_OF_CATEGORY: Final = 0.35
+MOST_OF_CATEGORY: Final = 0.5
 """Largest share of a category: the needs of people are not the same number in each."""
 DAYS: Final = Making(DayMaker, whole_scenes=True, tasks=TASKS_PER_DAY, most=MOST_OF_CATEGORY)
 """Making of days in whole scenes."""
