@@ -86,9 +86,8 @@ def plan_day(
     cast: Cast | None = None,
 ) -> PlannedDay | TaskRefusal:
     """Draw the needs of a day, lay out its scene and write its drafts. Equal arguments give equal days."""
-    rng = np.random.default_rng(
-        np.random.SeedSequence((seed, zlib.crc32(order.split.encode()), order.number))
-    )
+    place = zlib.crc32(f"{order.base} {order.split}".encode())
+    rng = np.random.default_rng(np.random.SeedSequence((seed, place, order.number)))
     cast = cast or people_of(order, seed)
     weights = need_weights(order.split, seed, order.missing)
     needs = draw_needs(SceneView(base), cast, NEEDS_OF_DAY, NEEDS_OF_EVENT, rng, weights)

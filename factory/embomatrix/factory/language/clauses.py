@@ -198,6 +198,9 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
     if _HAS_PLACE.search(clause.thing.words):
         # *I want the milk in the fridge on the table* misleads; a verb must part thing and place.
         forms = tuple(form for form in forms if "{x} {state}" not in form) or forms
+    if clause.thing.words.startswith("all "):
+        # *All the drinks can't stay* could mean that some can.
+        forms = tuple(form for form in forms if "can't" not in form) or forms
     it = {**fields, "x": clause.thing.it}
     do_it = _filled(_verb(clause, book, voice), it)
     return _written(voice.choose(forms), {**fields, "state": state, "do_it": do_it})
