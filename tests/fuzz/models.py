@@ -47,7 +47,7 @@ from embomatrix.factory.metrics.figures import (
     evaluation_to_json,
     read_evaluation,
 )
-from embomatrix.factory.pipeline.corpus import FROZEN_FILE, TRAIN, VERIFIED, check_frozen
+from embomatrix.factory.pipeline.corpus import FROZEN_FILE, TASKS, VERIFIED, check_frozen
 from embomatrix.factory.pipeline.export import merge_in_words
 from embomatrix.factory.pipeline.merge import MERGED_FILE
 from embomatrix.factory.pipeline.store import (
@@ -298,7 +298,7 @@ def _frozen(data: bytes) -> object:
     line = record_line()
     folder = in_file(f"corpus/{VERIFIED}/{FROZEN_FILE}", data).parents[1]
     in_file(f"corpus/{VERIFIED}/{TASKS_FILE}", line.replace(b'"train"', b'"heldout"'))
-    in_file(f"corpus/{TRAIN}/{TASKS_FILE}", line)
+    in_file(f"corpus/{TASKS}/{TASKS_FILE}", line)
     return check_frozen(folder)
 
 

@@ -10,6 +10,7 @@ import json
 import lzma
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
@@ -27,6 +28,40 @@ _FILTERS: Final = [
 ]
 _HEAD_BYTES: Final = 64 * 1024 * 1024
 """Maximum size of the records."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Settings from which the shipped dataset was built, as the options of ``embomatrix factory generate``."""
+
+    train: int
+    heldout: int
+    seed: int
+    scenes: tuple[str, ...]
+
+
+RECIPE: Final = Recipe(
+    train=640,
+    heldout=120,
+    seed=0,
+    scenes=(
+        "Rs_int",
+        "Beechwood_0_int",
+        "Merom_0_int",
+        "Merom_1_int",
+        "Pomaria_0_int",
+        "Pomaria_1_int",
+        "Benevolence_1_int",
+        "Ihlen_0_int",
+        "Wainscott_0_int",
+        "house_single_floor",
+        "office_cubicles_left",
+        "hotel_suite_small",
+        "grocery_store_cafe",
+        "restaurant_diner",
+    ),
+)
+"""Fourteen scenes; two of the ten homes are held out."""
 
 
 def content_digest(dataset: Dataset) -> str:

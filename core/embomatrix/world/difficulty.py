@@ -1,5 +1,6 @@
 """Difficulty of a task, as measured: which scripts solve it, and how long the oracle's plan is."""
 
+import hashlib
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -33,3 +34,8 @@ class Difficulty:
         if self.nearest:
             return DifficultyLevel.EASY
         return DifficultyLevel.MEDIUM if self.template else DifficultyLevel.HARD
+
+
+def shuffle_key(task_id: str) -> bytes:
+    """Sort key that shuffles tasks in the same way everywhere, whatever the order of their names."""
+    return hashlib.sha256(task_id.encode()).digest()

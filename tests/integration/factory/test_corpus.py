@@ -10,15 +10,20 @@ from typer.testing import CliRunner
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.pipeline.corpus import (
     FROZEN_FILE,
-    HELDOUT_SCENES,
+    HELDOUT,
+    STARTER,
+    TASKS,
     TRAIN,
-    UNSEEN,
     VERIFIED,
     CorpusSettings,
     check_frozen,
     freeze,
-    gather_heldout,
+    join_parts,
+    part_folder,
 )
+from embomatrix.factory.scenes.build import base_scene_of
+from embomatrix.starter.archive import unpack
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import Dataset, DatasetError, write_dataset
 from embomatrix.world.difficulty import Difficulty
 
@@ -28,21 +33,22 @@ def kitchen(tmp_path_factory):
     return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen")))
 
 
-def _written(folder, kitchen, splits, scene, kinds, words="Request {kind} in {scene}."):
+def _written(folder, kitchen, splits, scene, kinds, words="Request {kind} in {scene}.", room="kitchen_0"):
     """Write a dataset of kitchen tasks with the given scene, signatures and words."""
     records = [
         dataclasses.replace(
             record,
             split=split,
             signature=kind,
+            rooms=(room,),
             task=dataclasses.replace(
                 record.task,
-                task_id=f"{scene}-{number}",
+                task_id=f"{scene}-{kind}",
                 scene_id=f"{scene}-x",
                 instruction=words.format(kind=kind, scene=scene),
             ),
         )
-        for number, (record, split, kind) in enumerate(zip(kitchen.records, splits, kinds, strict=False))
+        for record, split, kind in zip(kitchen.records, splits, kinds, strict=False)
     ]
     write_dataset(
         folder,
@@ -53,38 +59,40 @@ def _written(folder, kitchen, splits, scene, kinds, words="Request {kind} in {sc
 
 def _freeze(folder, count=10):
     """Freeze the held-out tasks of a corpus as if each were hard."""
-    return freeze(folder, gather_heldout(folder).records, count)
+    join_parts(folder, (STARTER, HELDOUT))
+    return freeze(folder, Dataset.load(folder / TASKS).records, count)
 
 
 @pytest.fixture
 def corpus(tmp_path, kitchen):
-    """Corpus with two training tasks and one held-out task in one scene, and two tasks in another."""
-    _written(tmp_path / TRAIN, kitchen, ("train", "train", "heldout"), "Rs_int", "abc")
-    _written(tmp_path / UNSEEN, kitchen, ("heldout", "heldout"), "Ihlen_1_int", "de")
+    """Corpus whose first part has two training tasks in a scene and a held-out one in another, its second two held-out ones."""
+    _written(part_folder(tmp_path, STARTER), kitchen, ("train", "train"), "Rs_int", "ab")
+    _written(part_folder(tmp_path, HELDOUT), kitchen, ("heldout",) * 3, "Ihlen_1_int", "def")
     return tmp_path
 
 
-def test_held_out_tasks_of_both_builds_are_frozen_together(corpus):
+def test_parts_become_one_dataset_and_held_out_tasks_are_frozen(corpus):
     frozen = _freeze(corpus)
-    assert (frozen.tasks, frozen.unseen, frozen.scenes) == (3, 2, ("Ihlen_1_int", "Rs_int"))
+    assert (frozen.tasks, frozen.scenes) == (3, ("Ihlen_1_int",))
+    tasks = Dataset.load(corpus / TASKS)
+    assert (len(tasks.train), len(tasks.heldout)) == (2, 3)
     assert {record.split for record in Dataset.load(corpus / VERIFIED).records} == {"heldout"}
     assert check_frozen(corpus) == frozen
     assert _freeze(corpus) == frozen
 
 
-def test_the_hardest_tasks_are_frozen_most_of_them_in_unseen_scenes(corpus, kitchen):
-    _written(corpus / UNSEEN, kitchen, ("heldout",) * 3, "Ihlen_1_int", "dei")
-    hard = {"Ihlen_1_int-1", "Ihlen_1_int-2", "Rs_int-2"}
+def test_the_hardest_tasks_are_frozen_and_every_difficulty_is_stored(corpus):
+    join_parts(corpus, (STARTER, HELDOUT))
+    hard = {"Ihlen_1_int-e", "Ihlen_1_int-f"}
     measured = [
         dataclasses.replace(
             record, difficulty=Difficulty(False, record.task.task_id not in hard, True, 4, None)
         )
-        for record in gather_heldout(corpus).records
+        for record in Dataset.load(corpus / TASKS).records
     ]
     freeze(corpus, measured, 2)
-    frozen = [record.task.task_id for record in Dataset.load(corpus / VERIFIED).records]
-    assert frozen == ["Rs_int-2", *[name for name in frozen if name in hard and name.startswith("Ihlen")]]
-    assert len(frozen) == 2
+    assert {record.task.task_id for record in Dataset.load(corpus / VERIFIED).records} == hard
+    assert list(Dataset.load(corpus / TASKS).records) == measured
 
 
 def test_changed_task_is_detected(corpus):
@@ -102,19 +110,17 @@ def test_damaged_bundle_is_detected(corpus):
         check_frozen(corpus)
 
 
-def test_a_goal_of_one_scene_on_both_sides_is_refused(corpus, kitchen):
-    _written(corpus / TRAIN, kitchen, ("train", "train", "heldout"), "Rs_int", "aba", "Request {kind} or so.")
-    with pytest.raises(DatasetError, match=r"'Request a or so\.' is trained on and held out"):
-        _freeze(corpus)
-    _written(corpus / UNSEEN, kitchen, ("heldout", "heldout"), "Rs_int", "ae")
-    _written(corpus / TRAIN, kitchen, ("train", "train", "train"), "Rs_int", "abc", "Ask for {kind}.")
-    with pytest.raises(DatasetError, match="'a' in Rs_int are trained on and held out"):
-        _freeze(corpus)
+def test_a_training_task_that_gives_a_held_out_one_away_is_left_out(corpus, kitchen):
+    _written(part_folder(corpus, STARTER), kitchen, ("train", "train"), "Rs_int", "ad", "Request {kind}.")
+    _written(part_folder(corpus, HELDOUT), kitchen, ("heldout",) * 3, "Ihlen_1_int", "def", "Request {kind}.")
+    joined = join_parts(corpus, (STARTER, HELDOUT))
+    assert joined.dropped == 1
+    assert [record.signature for record in Dataset.load(corpus / TASKS).train] == ["a"]
 
 
-def test_majority_in_training_scenes_is_refused(corpus, kitchen):
-    _written(corpus / UNSEEN, kitchen, ("heldout",), "Rs_int", "d")
-    with pytest.raises(DatasetError, match="2 of 2 held-out tasks lie in scenes of training"):
+def test_a_scene_on_both_sides_is_refused(corpus, kitchen):
+    _written(part_folder(corpus, HELDOUT), kitchen, ("heldout",), "Rs_int", "c", room="pantry_0")
+    with pytest.raises(DatasetError, match="tasks in Rs_int are trained on and held out"):
         _freeze(corpus)
 
 
@@ -123,14 +129,19 @@ def test_missing_freeze_is_reported(corpus):
         check_frozen(corpus)
 
 
-def test_builds_share_the_seed_but_no_scene_and_most_held_out_tasks_are_unseen():
-    builds = CorpusSettings(seed=3).builds()
-    train, unseen = builds[TRAIN], builds[UNSEEN]
-    assert (train.train, train.heldout, unseen.heldout) == (2_000, 80, 120)
-    assert train.seed == unseen.seed == 3
-    assert len(train.scenes) == 45
-    assert not {*train.scenes} & {*unseen.scenes}
-    assert unseen.scenes == HELDOUT_SCENES
+def test_builds_add_to_the_shipped_dataset_in_scenes_of_their_own(tmp_path):
+    unpack(tmp_path)
+    starter = Dataset.load(tmp_path)
+    builds = CorpusSettings().builds(starter)
+    train, heldout = builds[TRAIN], builds[HELDOUT]
+    assert (train.train + len(starter.train), heldout.heldout + len(starter.heldout)) == (2_000, 200)
+    assert train.heldout == heldout.train == 0
+    used = [{*train.scenes}, {*heldout.scenes}, {base_scene_of(r.task.scene_id) for r in starter.records}]
+    assert sum(map(len, used)) == len(set.union(*used)) == len(Catalog.load().scene_ids)
+    homes = {base.removesuffix("_int") for base in {base_scene_of(r.task.scene_id) for r in starter.heldout}}
+    assert {f"{home}_garden" for home in homes} <= {*heldout.scenes}  # a garden shows much of its home
+    with pytest.raises(DatasetError, match=r"found --train 10 --heldout 200, expected more"):
+        CorpusSettings(train=10).builds(starter)
 
 
 def test_corpus_check_prints_the_frozen_digest(corpus):

@@ -1,20 +1,60 @@
-"""``embomatrix factory starter``: unpack the dataset that ships with the package."""
+"""``embomatrix factory starter``: unpack the dataset that ships with the package, or build it again by its recipe."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from embomatrix.factory.commands.terminal import say, user_errors
-from embomatrix.starter.archive import unpack
-from embomatrix.world.dataset import Dataset
+from embomatrix.factory.commands.build import make_dataset
+from embomatrix.factory.commands.difficulty import script_results
+from embomatrix.factory.commands.options import Jobs
+from embomatrix.factory.commands.terminal import fail, say, user_errors
+from embomatrix.factory.days.maker import DAYS
+from embomatrix.factory.evaluate.difficulty import with_scripts
+from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.starter.archive import RECIPE, content_digest, pack, unpack
+from embomatrix.world.dataset import Dataset, write_dataset
 
 
 def starter(
     out: Annotated[Path, typer.Option(help="Folder for the dataset.")] = Path("build/dataset"),
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Build the dataset by its recipe, resumably, and compare its digest with that of the shipped one.",
+        ),
+    ] = False,
+    packed: Annotated[
+        Path | None,
+        typer.Option(help="Build the dataset by its recipe, resumably, and pack it into this file."),
+    ] = None,
+    jobs: Jobs = None,
 ) -> None:
-    """Unpack the dataset that ships with the package."""
+    """Unpack the dataset that ships with the package. With --check or --packed, build it by its recipe; takes an hour."""
     with user_errors(out):
-        digest = unpack(out)
-        dataset = Dataset.load(out)
-    say(f"{len(dataset.train)} training and {len(dataset.heldout)} held-out tasks in {out}: {digest}")
+        if not check and packed is None:
+            digest = unpack(out)
+            dataset = Dataset.load(out)
+            say(f"{len(dataset.train)} training and {len(dataset.heldout)} held-out tasks in {out}: {digest}")
+            return
+        found = _built(out, jobs)
+        digest = content_digest(found) if packed is None else pack(found, packed)
+        say(f"{len(found.records)} tasks in {out}: {digest}")
+        if check:
+            shipped = unpack(out / "shipped")
+            if digest != shipped:
+                fail(
+                    f"the recipe gives {digest}, and the shipped dataset is {shipped}: this version builds other tasks"
+                )
+            say("the shipped dataset is what its recipe gives")
+
+
+def _built(out: Path, jobs: int | None) -> Dataset:
+    """Build the dataset of the recipe and store the difficulty of its tasks."""
+    settings = BuildSettings(RECIPE.train, RECIPE.heldout, RECIPE.seed, RECIPE.scenes, WriterKind.SOCIAL)
+    make_dataset(out, settings, jobs=jobs, making=DAYS)
+    dataset = Dataset.load(out)
+    results = script_results(dataset, dataset.records, dataset, jobs)
+    write_dataset(out, with_scripts(dataset.records, results), {})
+    return Dataset.load(out)

@@ -1,6 +1,5 @@
 """Measured difficulty: records with the success of scripts and of a small policy, and selections by level."""
 
-import hashlib
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -11,7 +10,7 @@ from typing import Final
 from embomatrix.factory.evaluate.scripts import ScriptName, ScriptResults
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.world.dataset import SPLITS, TaskRecord
-from embomatrix.world.difficulty import Difficulty, DifficultyLevel
+from embomatrix.world.difficulty import Difficulty, DifficultyLevel, shuffle_key
 from embomatrix.world.json_text import parse_json
 
 Shares = Mapping[DifficultyLevel, float]
@@ -102,7 +101,7 @@ def selected(
 
 def _of_split(split: str, records: Sequence[TaskRecord], shares: Shares) -> list[TaskRecord]:
     levels: dict[DifficultyLevel, list[TaskRecord]] = {level: [] for level in DifficultyLevel}
-    for record in sorted(records, key=lambda record: _lot(record.task.task_id)):
+    for record in sorted(records, key=lambda record: shuffle_key(record.task.task_id)):
         if record.difficulty is not None:
             levels[record.difficulty.level].append(record)
     wanted = {level: share for level, share in shares.items() if share > _TOLERANCE}
@@ -118,11 +117,6 @@ def _of_split(split: str, records: Sequence[TaskRecord], shares: Shares) -> list
         for level, share in wanted.items()
         for record in levels[level][: math.floor(total * share + _TOLERANCE)]
     ]
-
-
-def _lot(task_id: str) -> bytes:
-    """Return a number that orders tasks independently of their names' order."""
-    return hashlib.sha256(task_id.encode()).digest()
 
 
 def level_counts(records: Sequence[TaskRecord]) -> dict[str, Counter[DifficultyLevel]]:
