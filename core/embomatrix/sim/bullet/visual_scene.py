@@ -18,6 +18,7 @@ from embomatrix.sim.bullet.client import BulletClient, connect
 from embomatrix.sim.bullet.robot import Posture, load_robot, spread
 from embomatrix.sim.bullet.robot_model import DRIVEN_JOINTS
 from embomatrix.sim.geometry.bounds import joint_motion
+from embomatrix.sim.geometry.door_leaves import door_leaves
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape, Vec3
@@ -82,8 +83,8 @@ class VisualScene:
             self.add_solid(Shape.BOX, size, Pose((*room.center_m, -0.02)), _FLOORS[number % len(_FLOORS)])
 
     def add_walls(self, seen_as: Callable[[ConvexPart], ConvexPart | None]) -> None:
-        """Add the walls as ``seen_as`` returns them; None leaves a wall out."""
-        for wall in self.scene.walls:
+        """Add walls, and leaves of the doors between rooms, as ``seen_as`` returns them; None leaves one out."""
+        for wall in (*self.scene.walls, *door_leaves(self.scene)):
             seen = seen_as(wall)
             if seen is not None:
                 self._add_part(seen, IDENTITY, _material(wall))

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw, ImageOps
 from embomatrix.factory.pictures.labels import GAP, Box, Labels, boxes
 from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
 from embomatrix.factory.scenes.view import SceneView
+from embomatrix.sim.geometry.door_leaves import door_leaves
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import IDENTITY, Aabb
 from embomatrix.world.scene import Scene, SceneObject
@@ -50,7 +51,7 @@ _LEGEND: Final = (
     ("background", "background object without a name"),
 )
 _SIGNS: Final = (
-    "triangle: front · red: doorway · blue: window",
+    "triangle: front · red: doorway with its open door · blue: window",
     "ring: light or fan · dot: small object, green if it can move",
 )
 _ROOM_COLOR: Final = "#b03030"
@@ -126,7 +127,7 @@ class _Plan:
     def building(self) -> None:
         for number, room in enumerate(self._scene.rooms):
             self._draw.rectangle(self._box(room.low_m, room.high_m), fill=PALE[number % len(PALE)])
-        for wall in self._scene.walls:
+        for wall in (*self._scene.walls, *door_leaves(self._scene)):
             around = wall.aabb(IDENTITY)
             if around.low_m[2] <= 0.1:
                 fill = "#b5522b" if min(wall.size_m[:2]) < 0.1 else "#3a3a3a"
