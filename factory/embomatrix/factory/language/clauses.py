@@ -3,7 +3,7 @@
 import functools
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any, Final
@@ -39,6 +39,8 @@ _NO_PASSIVE: Final = (
     "empty",
     "wash the",
     "clean the",
+    "see",
+    "give",
     "start",
     "power",
     "stand",
@@ -54,6 +56,10 @@ LONG_WORDS: Final = 3
 """Spaces in a noun phrase from which on a particle does not follow it."""
 _HAS_PLACE: Final = re.compile(r" (?:on|in|under|with) ")
 """Prepositions in a noun phrase that tells a thing by its place."""
+_WHERE: Final = re.compile(r"(?<!cook) (?:on|in) (?=the |an? |[a-z' ]+ \d)")
+"""Preposition before the place of a thing; that of *something to cook in* is none."""
+_MOVING: Final = ("move ", "transfer ", "get ", "take ", "bring ")
+"""Verbs that part a thing from its place: *move the mugs from the desk to the sink*, where *put* would heap up places."""
 _PARTICLE_FIRST: Final = re.compile(r"\w+ (?:on|off|up|down|out) \{x\}")
 """Verbs that no pronoun follows: *turn it on*, not *turn on it*."""
 _PARTICLE: Final = re.compile(r"\{x\} (?:up|down|off|on|open|shut|over|away|again|through)\b(?! \{y\})")
@@ -133,19 +139,19 @@ class PhraseBook:
     def verbs(self, key: str, *, sourced: bool = False) -> tuple[str, ...]:
         """Return imperatives for a predicate."""
         table = _phrases()[key]
-        return self._known(key, table["sourced"] if sourced else table["verbs"])
+        return self.of_split(key, table["sourced"] if sourced else table["verbs"])
 
     def states(self, key: str) -> tuple[str, ...]:
-        return self._known(key, _phrases()[key]["states"])
+        return self.of_split(key, _phrases()[key]["states"])
 
     def forms(self, kind: str) -> tuple[str, ...]:
         """Return sentence forms: ``do``, ``done``, ``state``, ``belongs`` or ``moved``."""
-        return self._known(kind, _phrases()["forms"][kind])
+        return self.of_split(kind, _phrases()["forms"][kind])
 
     def joints(self, kind: str) -> tuple[str, ...]:
         return tuple(_phrases()["joints"][kind])
 
-    def _known(self, key: str, options: list[str]) -> tuple[str, ...]:
+    def of_split(self, key: str, options: Sequence[str]) -> tuple[str, ...]:
         """Return the options of the split: those not held out for training, and mostly held-out ones for the other."""
         held_out = [
             option for option in options[1:] if is_held_out(f"{key}:{option}", self._seed, HELD_OUT_PHRASES)
@@ -176,21 +182,30 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
         kinds += ["done"] if _is_sourced(clause) else ["done", "state", "state"]
         kinds += ["belongs"] * placed
         one_by_one = clause.thing.words.startswith(("each ", "every "))
-        kinds += ["moved", "moved"] * (placed and bool(clause.whence) and not one_by_one)
+        told_by_place = _HAS_PLACE.search(clause.thing.words) is not None
+        kinds += ["moved", "moved"] * (
+            placed and bool(clause.whence) and not one_by_one and not told_by_place
+        )
+    if clause.thing.words.startswith("any "):
+        kinds = ["do"]  # *any book must be on the table* could mean every book
     kind = voice.choose(kinds)
     fields = _fields(clause, speaker)
     if kind == "do":
         verb = _verb(clause, book, voice)
-        return _written(voice.choose(book.forms("do")), {**fields, **_active(verb, fields)})
+        return _written(
+            voice.choose(book.forms("do")), {**fields, **_active(verb, _parted(clause, verb, fields))}
+        )
     if kind == "done":
         passives = [p for v in _verbs(clause, book) if (p := _passive(v)) is not None]
         if not passives:
+            verb = _verb(clause, book, voice)
             return _written(
-                voice.choose(book.forms("do")), {**fields, **_active(_verb(clause, book, voice), fields)}
+                voice.choose(book.forms("do")), {**fields, **_active(verb, _parted(clause, verb, fields))}
             )
-        return _written(
-            voice.choose(book.forms("done")), {**fields, "done": _filled(voice.choose(passives), fields)}
-        )
+        forms = book.forms("done")
+        if _LEAVES_CHOICE.match(clause.thing.words):
+            forms = tuple(form for form in forms if "waiting" not in form) or forms
+        return _written(voice.choose(forms), {**fields, "done": _filled(voice.choose(passives), fields)})
     state = _filled(voice.choose(book.states(clause.key)), fields)
     forms = book.forms(kind)
     if _LEAVES_CHOICE.match(clause.thing.words):
@@ -208,7 +223,8 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
 
 def imperative_of(clause: Clause, book: PhraseBook, voice: Voice) -> str:
     """Return the clause as an imperative without a full stop, for lists and dialogues."""
-    return _filled(_verb(clause, book, voice), _fields(clause, Speaker()))
+    verb = _verb(clause, book, voice)
+    return _filled(verb, _parted(clause, verb, _fields(clause, Speaker())))
 
 
 def passive_of(clause: Clause, book: PhraseBook, voice: Voice) -> str:
@@ -228,6 +244,10 @@ def _is_sourced(clause: Clause) -> bool:
 def _verbs(clause: Clause, book: PhraseBook) -> tuple[str, ...]:
     """Return suitable imperatives. A particle does not follow a long noun phrase: *turn on the lamp on the desk*."""
     verbs = book.verbs(clause.key, sourced=_is_sourced(clause))
+    if clause.thing.count == 1:
+        verbs = tuple(verb for verb in verbs if not verb.startswith("arrange")) or verbs
+    if clause.key in PLACED and _WHERE.search(clause.thing.words):
+        verbs = tuple(verb for verb in verbs if verb.startswith(_MOVING)) or verbs
     if clause.bare:
         return tuple(verb for verb in verbs if not _PARTICLE_FIRST.match(verb)) or verbs
     if clause.thing.words.count(" ") < LONG_WORDS:
@@ -237,6 +257,14 @@ def _verbs(clause: Clause, book: PhraseBook) -> tuple[str, ...]:
 
 def _verb(clause: Clause, book: PhraseBook, voice: Voice) -> str:
     return voice.choose(_verbs(clause, book))
+
+
+def _parted(clause: Clause, verb: str, fields: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the fields with *from* before the place of the thing, if the verb moves it and it is a single phrase."""
+    words = clause.thing.words
+    if clause.key not in PLACED or not verb.startswith(_MOVING) or re.search(r" (?:and|or) ", words):
+        return fields
+    return {**fields, "x": _WHERE.sub(" from ", words, count=1)}
 
 
 def _fields(clause: Clause, speaker: Speaker) -> dict[str, str]:

@@ -250,6 +250,8 @@ def all_of(describer: Describer, description: Description, count: int) -> NounPh
         ("both" if count == 2 else f"all {many}", 2), ("each of the", 1),
     ]  # fmt: skip
     determiner, number = options[int(describer.voice.rng.integers(len(options)))]
+    if is_plural(description.noun.one) and determiner == "every":
+        determiner, number = "all the", 2  # there is no *every jeans*
     singular = determiner == "every"
     words = describer.phrase(description, 1 if singular else count, determiner.strip())
     return NounPhrase(words, 1 if number == 1 else count)

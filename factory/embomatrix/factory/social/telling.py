@@ -88,7 +88,9 @@ class Teller:
         first = asked[0].need
         speaker = Speaker() if self._rng() < FIRST_PERSON_SHARE else Speaker(first.person.name)
         greeting = "" if speaker.name else self.voice.choose(_GREETINGS).format(name=first.person.name)
-        why = self._personal(_naming(self.voice.choose(first.event.why)), first, speaker)
+        why = self._personal(
+            _naming(self.voice.choose(self.book.of_split("why", first.event.why))), first, speaker
+        )
         is_named = bool(speaker.name) and speaker.name in why
         later = Speaker("She" if is_female(speaker.name) else "He") if is_named else speaker
         parts = [greeting + capitalised(why)]
@@ -98,7 +100,8 @@ class Teller:
             if number:
                 parts.append(self._turn_to(needs[0].need, later))
             said = [said for each in needs for said in self._requests(each, later)]
-            parts.append(self._joined(said, speaker.name, ends=number == len(groups) - 1))
+            known = bool(speaker.name) and any(speaker.name in part for part in parts)
+            parts.append(self._joined(said, speaker.name, known=known, ends=number == len(groups) - 1))
             if event.before and self._rng() < BEFORE_SHARE:
                 parts.append(
                     self._deadline(event, later, is_one=len(needs) == 1 and len(needs[0].conditions) == 1)
@@ -108,7 +111,7 @@ class Teller:
 
     def _turn_to(self, need: NeedOfDay, speaker: Speaker) -> str:
         """Return the reason of a later event, after words that turn to another matter."""
-        why = self._personal(self.voice.choose(need.event.why), need, speaker)
+        why = self._personal(self.voice.choose(self.book.of_split("why", need.event.why)), need, speaker)
         return f"{self.voice.choose(self.book.joints('turn'))}{capitalised(why)}"
 
     def _deadline(self, event: Event, speaker: Speaker, *, is_one: bool) -> str:
@@ -119,17 +122,21 @@ class Teller:
 
     def reason(self, need: NeedOfDay) -> str:
         """Return a sentence about the event in the first person."""
-        return self._personal(self.voice.choose(need.event.why), need, Speaker())
+        return self._personal(self.voice.choose(self.book.of_split("why", need.event.why)), need, Speaker())
 
     def _rng(self) -> float:
         return float(self.voice.rng.random())
 
-    def _joined(self, said: Sequence[_Said], name: str, *, ends: bool) -> str:
-        """Return the sentences with joints before some of them. ``name`` is the speaker's. ``ends``: nothing follows."""
-        told = []
+    def _joined(self, said: Sequence[_Said], name: str, *, known: bool, ends: bool) -> str:
+        """Return the sentences with joints before some of them.
+
+        ``name`` is the speaker's, ``known`` if it was said before. ``ends``: nothing follows.
+        """
+        told: list[str] = []
         for number, (sentence, is_request) in enumerate(said):
-            if name and number and sentence.startswith(f"{name} "):
+            if name and known and sentence.startswith(f"{name} "):
                 sentence = f"{'She' if is_female(name) else 'He'}{sentence.removeprefix(name)}"
+            known = known or (bool(name) and name in sentence)
             last = ends and number == len(said) - 1
             kind = "first" if not number else "last" if last else "next"
             takes_joint = is_request and len(said) > 1 and not _TAKES_NO_JOINT.match(sentence)
@@ -147,7 +154,8 @@ class Teller:
         return any(each.place and len(asked.members[each.place]) > 1 for each in asked.conditions)
 
     def _implied(self, asked: Asked, speaker: Speaker) -> str:
-        text = self._personal(self.voice.choose(asked.need.need.say), asked.need, speaker)
+        options = self.book.of_split("say", asked.need.need.say)
+        text = self._personal(self.voice.choose(options), asked.need, speaker)
 
         def words(match: re.Match[str]) -> str:
             label = match.group(1)
