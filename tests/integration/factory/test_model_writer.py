@@ -11,7 +11,7 @@ from tests.fakes.chat_server import ChatServer
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.commands.app import _print_account
 from embomatrix.factory.days.laying import LaidOut, lay_out
-from embomatrix.factory.days.model_days import ModelDays, planned_task
+from embomatrix.factory.days.model_days import ModelDays, planned_task, with_tools
 from embomatrix.factory.days.planning import PlannedDay
 from embomatrix.factory.evaluate.lies import LieTable, ScriptedModel, ScriptedRequest
 from embomatrix.factory.pipeline.variants import VariantOrder
@@ -300,6 +300,31 @@ def test_a_thing_that_the_scene_lacks_is_laid_out_for_the_models_request() -> No
     assert task.draft.task.instruction == words
     assert words in task.draft.transcript
     assert day.scene.by_name["violin_1"].host.startswith("coffee_table")
+
+
+@pytest.mark.parametrize("kind", ["bottom_cabinet", "top_cabinet"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wall_cabinet_is_no_low_cabinet_though_both_have_one_type(kind: str, seed: int) -> None:
+    cabinet = WishedObjects(label="cabinet", kind=kind, room="kitchen_0", furniture=True)
+    wish = Wish(
+        objects=(cabinet,), conditions=(Condition(predicate=WishPredicate.OPEN, things="cabinet"),)
+    )
+    laid = lay_out("cabinet", [wish], BASE, np.random.default_rng(seed), exact=True)
+    assert isinstance(laid, LaidOut), laid
+    assert SceneView(laid.scene).category(laid.members[0]["cabinet"][0]) == kind
+
+
+def test_wishes_get_the_tool_that_nobody_mentions() -> None:
+    counter = WishedObjects(label="counter", kind="countertop", room="kitchen_0", furniture=True)
+    apple = WishedObjects(label="apple", kind="apple", relation=Relation.ONTOP, host="counter")
+    knife = WishedObjects(label="knife", kind="carving_knife", relation=Relation.ONTOP, host="counter")
+    slices = (Condition(predicate=WishPredicate.SLICED, things="apple"),)
+    tool = with_tools(Wish(objects=(counter, apple), conditions=slices)).objects[-1]
+    assert (tool.kind, tool.room) == ("carving_knife", "kitchen_0")
+    own = Wish(objects=(counter, apple, knife), conditions=slices)
+    assert with_tools(own) == own
+    clean = (Condition(predicate=WishPredicate.STAINED, things="counter", holds=False),)
+    assert with_tools(Wish(objects=(counter,), conditions=clean)).objects[-1].kind == "rag"
 
 
 def test_words_that_also_fit_another_object_of_the_scene_are_refused() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.request import LayoutAgents
-from embomatrix.factory.social.wish import Wish, problem_of
+from embomatrix.factory.social.wish import FLOOR, Wish, problem_of
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
 from embomatrix.world.bddl import render_problem
@@ -43,12 +43,19 @@ def lay_out(
     base: Scene,
     rng: np.random.Generator,
     agents: LayoutAgents | None = None,
+    *,
+    exact: bool = False,
 ) -> LaidOut | TaskRefusal:
-    """Lay out the base scene for all wishes, or for as many as find their place. A refusal is that of the last layout."""
-    options = ImportOptions(lay=partial(lay, agents=agents))
+    """Lay out the base scene for all wishes, or for as many as find their place. A refusal is that of the last layout.
+
+    If ``exact``, objects have the category that their wish names; otherwise a low cabinet may stand for a wall cabinet,
+    which have one type.
+    """
     kept = list(range(len(wishes)))
     while True:
         problem, labels = problem_of(name, [wishes[at] for at in kept])
+        kinds = _kinds([wishes[at] for at in kept], labels) if exact else {}
+        options = ImportOptions(lay=partial(lay, agents=agents), categories=kinds)
         source = SourceText(name, render_problem(problem), SOURCE)
         imported = import_problem(source, base, seed=int(rng.integers(SEEDS)), options=options)
         if not isinstance(imported, TaskRefusal):
@@ -58,6 +65,17 @@ def lay_out(
         if len(kept) == 1 or len(kept) <= len(wishes) - MAX_LAYOUTS:
             return imported
         del kept[_at_fault(imported, labels, rng)]
+
+
+def _kinds(wishes: Sequence[Wish], labels: Sequence[Mapping[str, tuple[str, ...]]]) -> dict[str, str]:
+    """Return the category of each object of the wishes. Floors have none."""
+    return {
+        name: group.kind
+        for wish, names in zip(wishes, labels, strict=True)
+        for group in wish.objects
+        if group.kind != FLOOR
+        for name in names[group.label]
+    }
 
 
 def _at_fault(

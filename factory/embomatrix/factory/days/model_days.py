@@ -21,12 +21,21 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.day import wanted_kinds
 from embomatrix.factory.social.model.writer import ModelWriter
 from embomatrix.factory.social.scene_kinds import kinds_of
+from embomatrix.factory.social.wish import FLOOR, Wish, WishedObjects, WishPredicate
 from embomatrix.factory.social.written import WrittenRequest
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
 REQUESTS_OF_DAY: Final = 6
 """Number of requests that a day asks the model for."""
+
+
+TOOLS: Final = (
+    (frozenset({WishPredicate.SLICED}), "slicer", "spare_knife", "carving_knife"),
+    (frozenset({WishPredicate.DUSTY, WishPredicate.STAINED}), "particleRemover", "spare_cloth", "rag"),
+)
+"""Tools by the predicates that need one: the ability, the label and the category."""
 
 
 class ModelDays:
@@ -51,7 +60,8 @@ class ModelDays:
                 RefusalReason.UNUSABLE_ANSWER, "the model wrote no request that could be used"
             )
             return refusals[-1] if refusals else reason
-        laid = lay_out(day_name(order), [each.wish for each in requests], base, rng, self._agents)
+        wishes = [with_tools(each.wish) for each in requests]
+        laid = lay_out(day_name(order), wishes, base, rng, self._agents, exact=True)
         if isinstance(laid, TaskRefusal):
             return laid
         view = SceneView(laid.scene)
@@ -63,6 +73,27 @@ class ModelDays:
             else:
                 tasks.append(found)
         return PlannedDay(laid.scene, tuple(tasks), tuple(refusals))
+
+
+def with_tools(wish: Wish) -> Wish:
+    """Return the wish with the knife or the cloth that its conditions need, if it declares none. Nobody mentions these."""
+    catalog = Catalog.load()
+    kinds = [group.kind for group in wish.objects if group.kind != FLOOR]
+    abilities = {ability for kind in kinds for ability in catalog.abilities_of(catalog.synset_of(kind))}
+    added = []
+    for predicates, ability, label, tool in TOOLS:
+        about = next((each.things for each in wish.conditions if each.predicate in predicates), None)
+        if about is not None and ability not in abilities and label not in wish.groups:
+            added.append(WishedObjects(label=label, kind=tool, room=_room_of(wish, about)))
+    return wish.model_copy(update={"objects": (*wish.objects, *added)}) if added else wish
+
+
+def _room_of(wish: Wish, label: str) -> str:
+    """Return the room of a group, which may be that of its host."""
+    group = wish.groups[label]
+    while not group.room and group.host:
+        group = wish.groups[group.host]
+    return group.room
 
 
 def _of_different_things(requests: Sequence[WrittenRequest]) -> list[WrittenRequest]:

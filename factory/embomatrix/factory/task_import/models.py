@@ -28,8 +28,13 @@ LOOKED_AT: Final = 4 * MODEL_TRIES
 """Maximum number of models whose abilities are checked."""
 
 
-def models_for(addition: Addition, rng: np.random.Generator, requirement: Requirement) -> list[Model]:
-    """Return at most five models of the type with the required abilities, liftable ones first.
+def models_for(
+    addition: Addition,
+    rng: np.random.Generator,
+    requirement: Requirement,
+    categories: Sequence[str] | None = None,
+) -> list[Model]:
+    """Return at most five models of the type, or of these categories, with the required abilities, liftable ones first.
 
     Among liftable models, large ones come first if the object supports others, otherwise small ones. Among furniture,
     two of medium size come first, then the smallest. On other furniture only small models are used. If no liftable
@@ -38,7 +43,7 @@ def models_for(addition: Addition, rng: np.random.Generator, requirement: Requir
     catalog = Catalog.load()
     models = [
         (model, catalog.category(category).mass_kg)
-        for category in catalog.categories_of(addition.type)
+        for category in categories or catalog.categories_of(addition.type)
         for model in catalog.models_of(category)
     ]
     light: list[tuple[float, Model]] = []

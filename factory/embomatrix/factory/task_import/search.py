@@ -3,8 +3,8 @@
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -50,6 +50,16 @@ class BindingOptions:
     """If true, goals that no skill reaches are refused. Otherwise goals must only be evaluable."""
     renumbering: bool = False
     """If true, ``kitchen_0`` may be another kitchen, since other datasets number rooms differently."""
+    categories: Mapping[str, str] = field(default_factory=dict)
+    """Category of an object by its name, where the type alone leaves a choice."""
+
+    def categories_of(self, problem: BddlProblem, name: str) -> Sequence[str]:
+        """Return the categories that an object of the problem may have."""
+        return (
+            (self.categories[name],)
+            if name in self.categories
+            else (Catalog.load().categories_of(problem.objects[name]))
+        )
 
 
 def search(
@@ -75,7 +85,9 @@ def search(
     lacking = ""
     for rooms in itertools.islice(_room_choices(words, candidates), MAX_CHOICES):
         wanted = {name: rooms[inroom[name]] for name in fixtures}
-        found, missing = _assign(*_domains(problem, view, wanted, needs, requirements, rng, excluded))
+        found, missing = _assign(
+            *_domains(problem, view, wanted, needs, requirements, rng, excluded, options)
+        )
         if not missing:
             return rooms, found
         first = missing[0]
@@ -139,16 +151,16 @@ def _domains(
     requirements: Mapping[str, Requirement],
     rng: np.random.Generator,
     excluded: Container[str],
+    options: BindingOptions,
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Return candidate scene objects for each name, the best first, and the names of furniture without any."""
-    catalog = Catalog.load()
     hosts = {host for _, host in problem.initial_pairs(Relation.ONTOP, Relation.INSIDE)}
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():
         requirement = requirement_on(requirements, name, problem.objects[name])
         contents = requirement.contents
-        categories = set(catalog.categories_of(problem.objects[name]))
+        categories = set(options.categories_of(problem, name))
         fits = [
             other
             for other in view.in_room.get(room, ())

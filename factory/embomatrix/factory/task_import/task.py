@@ -233,7 +233,13 @@ class _Binder:
             for name, type_name in self._problem.objects.items()
         }
         orders = {
-            each.name: models_for(each, self._rng, requirements[each.name]) for each in binding.additions
+            each.name: models_for(
+                each,
+                self._rng,
+                requirements[each.name],
+                self._options.categories_of(binding.problem, each.name),
+            )
+            for each in binding.additions
         }
         for addition in binding.additions:
             if not orders[addition.name]:
