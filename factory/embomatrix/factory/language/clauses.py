@@ -246,6 +246,8 @@ def _verbs(clause: Clause, book: PhraseBook) -> tuple[str, ...]:
     verbs = book.verbs(clause.key, sourced=_is_sourced(clause))
     if clause.thing.count == 1:
         verbs = tuple(verb for verb in verbs if not verb.startswith("arrange")) or verbs
+    if clause.place.startswith("the floor of "):
+        verbs = tuple(verb for verb in verbs if "on top" not in verb) or verbs
     if clause.key in PLACED and _WHERE.search(clause.thing.words):
         verbs = tuple(verb for verb in verbs if verb.startswith(_MOVING)) or verbs
     if clause.bare:
