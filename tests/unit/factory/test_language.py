@@ -115,7 +115,7 @@ def test_a_description_fits_exactly_the_objects_that_are_meant(names: set[str], 
 
 
 def test_an_object_among_others_of_its_kind_is_told_by_its_place() -> None:
-    assert describer().definite(["mug_3"], kinds=False) == "the mug in the cabinet sink"
+    assert describer().definite(["mug_3"], kinds=False) == "the mug in the sink unit"
     assert describer().definite(["mug_1", "mug_2"], kinds=False) == "the mugs on the table"
     assert describer().definite(["mug_1"], kinds=False) == ""
 

@@ -56,7 +56,7 @@ LONG_WORDS: Final = 3
 """Spaces in a noun phrase from which on a particle does not follow it."""
 _HAS_PLACE: Final = re.compile(r" (?:on|in|under|with) ")
 """Prepositions in a noun phrase that tells a thing by its place."""
-_WHERE: Final = re.compile(r"(?<!cook) (?:on|in) (?=the |an? |[a-z' ]+ \d)")
+_WHERE: Final = re.compile(r"(?<!cook) (?:on|in) (?=the |an? |one of |[a-z' ]+ \d)")
 """Preposition before the place of a thing; that of *something to cook in* is none."""
 _MOVING: Final = ("move ", "transfer ", "get ", "take ", "bring ")
 """Verbs that part a thing from its place: *move the mugs from the desk to the sink*, where *put* would heap up places."""
@@ -290,7 +290,8 @@ def _fields(clause: Clause, speaker: Speaker) -> dict[str, str]:
 
 def _active(verb: str, fields: Mapping[str, str]) -> dict[str, str]:
     first, _, rest = verb.partition(" ")
-    return {"do": _filled(verb, fields), "doing": _filled(f"{gerund(first)} {rest}", fields)}
+    doing = re.sub(r"\band (\w+)", lambda match: f"and {gerund(match[1])}", f"{gerund(first)} {rest}")
+    return {"do": _filled(verb, fields), "doing": _filled(doing, fields)}
 
 
 def _passive(verb: str) -> str | None:

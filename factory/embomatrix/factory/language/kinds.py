@@ -29,6 +29,8 @@ class Kind:
     noun: Noun
     members: frozenset[str]
     use: str = ""
+    several: bool = False
+    """True if the noun is natural only for several things, as *things to read* is and *the thing to read* is not."""
 
 
 @functools.cache
@@ -36,7 +38,13 @@ def kinds() -> Mapping[str, Kind]:
     """Return all kinds by name."""
     text = (resources.files("embomatrix.factory.language") / FILE).read_text(encoding="utf-8")
     return {
-        name: Kind(name, Noun(entry["one"], entry["many"]), frozenset(entry["members"]), entry.get("use", ""))
+        name: Kind(
+            name,
+            Noun(entry["one"], entry["many"]),
+            frozenset(entry["members"]),
+            entry.get("use", ""),
+            entry.get("several", False),
+        )
         for name, entry in tomllib.loads(text).items()
     }
 

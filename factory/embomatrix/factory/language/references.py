@@ -48,6 +48,8 @@ class Description:
     categories: frozenset[str]
     kind: str = ""
     use: str = ""
+    several: bool = False
+    """True if the noun has no natural singular."""
     state: str = ""
     room: str = ""
     relation: Relation | None = None
@@ -166,8 +168,9 @@ class Describer:
             heads.append(self._head(rows[0].category))
         if kinds:
             heads += [
-                Description(kind.noun, kind.members, kind.name, kind.use)
+                Description(kind.noun, kind.members, kind.name, kind.use, kind.several)
                 for kind in kinds_with(categories)
+                if not (kind.several and len(wanted) == 1)
                 if self.split == "heldout" or not is_held_out(kind.name, self.seed, HELD_OUT_KINDS)
             ]
         restrictions = list(self._restrictions(rows))
@@ -232,7 +235,7 @@ class Describer:
             if len(found) == 1:
                 yield found, self.phrase(each, 1)
                 return
-            yield found, with_article(self.phrase(each, 1, ""))
+            yield found, self.phrase(each, 2, "one of the")
 
 
 FLOOR: Final = "floors"
@@ -250,7 +253,7 @@ def all_of(describer: Describer, description: Description, count: int) -> NounPh
         ("both" if count == 2 else f"all {many}", 2), ("each of the", 1),
     ]  # fmt: skip
     determiner, number = options[int(describer.voice.rng.integers(len(options)))]
-    if is_plural(description.noun.one) and determiner == "every":
+    if determiner == "every" and (description.several or is_plural(description.noun.one)):
         determiner, number = "all the", 2  # there is no *every jeans*
     singular = determiner == "every"
     words = describer.phrase(description, 1 if singular else count, determiner.strip())
@@ -262,9 +265,12 @@ def any_of(describer: Describer, description: Description, count: int) -> NounPh
     options = [
         describer.phrase(description, count, "one of the"),
         describer.phrase(description, count, "any of the"),
-        with_article(describer.phrase(description, 1, "")),
-        describer.phrase(description, 1, "any"),
     ]
+    if not description.several:
+        options += [
+            with_article(describer.phrase(description, 1, "")),
+            describer.phrase(description, 1, "any"),
+        ]
     if description.use:
         options += 2 * [" ".join([description.use, *describer._after(description)])]
     return NounPhrase(describer.voice.choose(options))
