@@ -64,7 +64,14 @@ def test_one_dialogue_gives_several_requests_with_their_conversation() -> None:
     first = found[0]
     assert isinstance(first, WrittenRequest)
     assert first.wish == HONEST["book"].wish
-    assert [turn.speaker for turn in first.conversation.turns] == ["Maya", "robot", "Jonas", "robot"]
+    assert [turn.speaker for turn in first.conversation.turns] == [
+        "Maya",
+        "robot",
+        "Maya",
+        "robot",
+        "Jonas",
+        "robot",
+    ]
     assert first.signature == "ontop(hardback,coffee_table)"
     assert "**Jonas** (answer)" in first.transcript()
 
@@ -72,14 +79,16 @@ def test_one_dialogue_gives_several_requests_with_their_conversation() -> None:
 def test_each_turn_is_one_call_with_the_knowledge_of_its_speaker_alone() -> None:
     model = scripted("book", "oven")
     written(model, 2)
-    maya, robot, jonas, last = prompts(model, TURN)
+    maya, robot, again, _, jonas, last = prompts(model, TURN)
     event = "A thing that was left on the bed is needed"
     other = "Something from the fridge would be good"
     assert event in maya
     assert other not in maya
     assert other in jonas
     assert event not in jonas
+    assert event in again
     assert "reads on the sofa before bed" in maya
+    assert "You are Ella's father." in jonas
     assert "bakes on Sundays" in jonas
     for heard in (robot, last):
         assert event not in heard
@@ -157,7 +166,7 @@ class _Garbage:
         return await self._model.complete(request)
 
 
-@pytest.mark.parametrize(("purposes", "most"), [((), 9), ((TURN,), 12), ((SUMMARY,), 30)])
+@pytest.mark.parametrize(("purposes", "most"), [((), 9), ((TURN,), 12), ((SUMMARY,), 40)])
 def test_garbage_ends_the_writing_after_a_bounded_number_of_calls(
     purposes: tuple[str, ...], most: int
 ) -> None:
@@ -217,7 +226,7 @@ def test_dialogue_without_confirmation_leads_to_no_request() -> None:
     model = _Evasive(TABLE.people, [HONEST["book"]])
     with (
         ModelWriter(SocialModelAgents(model)) as writer,
-        pytest.raises(UnusableReplyError, match="the robot confirmed nothing in 6 turns"),
+        pytest.raises(UnusableReplyError, match="the robot confirmed nothing in 8 turns"),
     ):
         writer.write(SCENE, 1, 0)
     assert not prompts(model, SUMMARY)
@@ -306,9 +315,7 @@ def test_a_thing_that_the_scene_lacks_is_laid_out_for_the_models_request() -> No
 @pytest.mark.parametrize("seed", range(3))
 def test_a_wall_cabinet_is_no_low_cabinet_though_both_have_one_type(kind: str, seed: int) -> None:
     cabinet = WishedObjects(label="cabinet", kind=kind, room="kitchen_0", furniture=True)
-    wish = Wish(
-        objects=(cabinet,), conditions=(Condition(predicate=WishPredicate.OPEN, things="cabinet"),)
-    )
+    wish = Wish(objects=(cabinet,), conditions=(Condition(predicate=WishPredicate.OPEN, things="cabinet"),))
     laid = lay_out("cabinet", [wish], BASE, np.random.default_rng(seed), exact=True)
     assert isinstance(laid, LaidOut), laid
     assert SceneView(laid.scene).category(laid.members[0]["cabinet"][0]) == kind
@@ -325,6 +332,31 @@ def test_wishes_get_the_tool_that_nobody_mentions() -> None:
     assert with_tools(own) == own
     clean = (Condition(predicate=WishPredicate.STAINED, things="counter", holds=False),)
     assert with_tools(Wish(objects=(counter,), conditions=clean)).objects[-1].kind == "rag"
+
+
+def test_a_person_with_nothing_to_add_says_thanks() -> None:
+    model = _Satisfied(TABLE.people, [HONEST["book"]])
+    first = written(model)[0]
+    assert isinstance(first, WrittenRequest)
+    assert [turn.act.value for turn in first.conversation.turns][-1] == "thanks"
+    assert {turn.speaker for turn in first.conversation.turns} == {"Maya", "robot", "Jonas"}
+
+
+class _Satisfied(ScriptedModel):
+    """Robot that confirms at once, and people who thank it when they are heard."""
+
+    def _turn(self, request: ChatRequest) -> object:
+        told = " ".join(each.instruction for each in self.requests)
+        if "You are a household robot" in request.messages[0].text:
+            return {"act": "confirm", "text": f"I will do this: {told}"}
+        return (
+            {"act": "need", "text": told}
+            if "robot:" not in request.messages[1].text
+            else {
+                "act": "thanks",
+                "text": "Thank you, that is all.",
+            }
+        )
 
 
 def test_words_that_also_fit_another_object_of_the_scene_are_refused() -> None:
@@ -359,6 +391,7 @@ def test_build_summary_tells_calls_and_tokens_for_each_admitted_task(
 
 def test_scene_description_is_short_and_counts_alike_furniture() -> None:
     text = SCENE.listed()
-    assert "5 x top_cabinet" in text
-    assert "2 x pot_plant on coffee_table" in text
-    assert len(text) < 700
+    assert '5 x top_cabinet "wall cabinet"' in text
+    assert '2 x pot_plant "potted plant" on coffee_table' in text
+    assert len(text) < 1000
+    assert "5 x wall cabinet" in SCENE.told()

@@ -73,14 +73,14 @@ class SceneKinds:
         return replace(self, rooms=types, kinds=tuple(each for each in self.kinds if each.room in wanted))
 
     def listed(self) -> str:
-        """Return one line for each room with the catalog's names, for answers that must use them."""
-        return self._lines(lambda kind: kind)
+        """Return one line for each room with the catalog's names, for answers that must use them, and everyday words."""
+        return self._lines(_with_noun, lambda room: room)
 
     def told(self) -> str:
         """Return one line for each room in everyday words, for people's dialogues."""
-        return self._lines(everyday_noun)
+        return self._lines(everyday_noun, lambda room: room.replace("_", " "))
 
-    def _lines(self, name_of: Callable[[str], str]) -> str:
+    def _lines(self, name_of: Callable[[str], str], room_of: Callable[[str], str]) -> str:
         lines = []
         for room in self.rooms:
             mine = [each for each in self.kinds if each.room == room]
@@ -89,8 +89,14 @@ class SceneKinds:
                 f"{each.in_words(name_of(each.kind))} on {name_of(each.host)}" for each in mine if each.host
             ]
             sight = f" {self.sights[room]}" if self.sights.get(room) else ""
-            lines.append(f"{room}:{sight} {', '.join(names) or 'empty'}")
+            lines.append(f"{room_of(room)}:{sight} {', '.join(names) or 'empty'}")
         return "\n".join(lines)
+
+
+def _with_noun(kind: str) -> str:
+    """Return the name of a kind, with its everyday noun in quotes if people call it otherwise."""
+    noun = everyday_noun(kind)
+    return kind if noun == kind.replace("_", " ") else f'{kind} "{noun}"'
 
 
 def kinds_of(view: SceneView, rooms: Iterable[str] | None = None) -> SceneKinds:

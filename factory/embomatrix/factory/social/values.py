@@ -92,6 +92,7 @@ class Act(StrEnum):
     AMEND = "amend"  # a cast member changes the request
     ADD = "add"  # a cast member adds a request
     CONFIRM = "confirm"  # the robot confirms the request
+    THANKS = "thanks"  # the cast member has nothing to add
 
 
 class DialogueTurn(StrictModel):

@@ -9,9 +9,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
-from typing import Final
+from typing import Annotated, Final
 
-from pydantic import Field, model_validator
+from pydantic import Field, WithJsonSchema, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
 from embomatrix.factory.social.values import StrictModel
 from embomatrix.world.bddl import BddlProblem, InitLiteral
@@ -83,12 +84,12 @@ class WishedObjects(StrictModel):
     kind: str = Field(min_length=1, max_length=60)
     count: int = Field(default=1, ge=1, le=MAX_COUNT)
     room: str = Field(default="", max_length=64)
-    relation: Relation | None = None
+    relation: Annotated[Relation | None, WithJsonSchema({"type": "string", "enum": sorted(PLACED)})] = None
     host: str = ""
     furniture: bool = False
     states: tuple[State, ...] = ()
     """States at the start, such as ``open`` or ``dusty``."""
-    decoy: bool = False
+    decoy: SkipJsonSchema[bool] = False
     """True for objects that no condition is about: they make the description necessary."""
 
 

@@ -4,11 +4,14 @@ Each agent requests a typed answer and checks it. Problems are returned to the m
 scene are marked as data, so that instructions in names are ignored.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Final, TypeVar
 
 from pydantic import BaseModel
 
+from embomatrix.factory.language.nouns import everyday_noun
+from embomatrix.factory.social.knowledge import events
 from embomatrix.factory.social.model.answers import (
     DayAnswer,
     EventAnswer,
@@ -59,8 +62,17 @@ TURN_TOKENS: Final = 160
 """Maximum number of tokens in a turn."""
 ATTEMPTS: Final = 2
 """Answers requested for one question."""
-LISTED_EARLIER: Final = 12
+LISTED_EARLIER: Final = 24
 """Number of earlier instructions that the day planner sees."""
+
+
+@functools.cache
+def _small_things() -> str:
+    """Return the names of small things that authored needs are about."""
+    roles = (role for event in events() for need in event.needs for role in need.roles)
+    kinds = {kind for role in roles if role.host for kind in role.kinds}
+    return ", ".join(sorted(everyday_noun(kind) for kind in kinds))
+
 
 T = TypeVar("T", bound=BaseModel)
 
@@ -123,8 +135,9 @@ class SocialModelAgents:
         )
         told = "\n".join(f"- {line}" for line in earlier[-LISTED_EARLIER:])
         before = EARLIER.format(lines=told) if told else ""
-        user = DAY_USER.format(scene=scene.told(), people=people, earlier=before)
-        return (await self._ask(DAY, DAY_SYSTEM, user, seed, DayAnswer, check)).events
+        system = DAY_SYSTEM.format(things=_small_things())
+        user = DAY_USER.format(scene=scene.listed(), people=people, earlier=before)
+        return (await self._ask(DAY, system, user, seed, DayAnswer, check)).events
 
     async def person_turn(
         self,
@@ -139,29 +152,42 @@ class SocialModelAgents:
         person = household.person(name)
         needs = event.needs if name == event.person else (event.other_need,)
         others = [each for each in (event.person, event.other) if each not in ("", name)]
-        ties = "".join(f"You are {tie} of {other}. " for other, tie in person.ties.items())
+        ties = "".join(f"You are {other}'s {tie}. " for other, tie in person.ties.items())
         system = PERSON_SYSTEM.format(
             name=name,
             age=person.age,
             job=person.job,
             hobby=person.hobby,
             ties=ties,
-            habits="".join(f"Habit: {habit}. " for habit in household.habits[name]),
+            habits="".join(f"Habit: {_unended(habit)}. " for habit in household.habits[name]),
             time=event.time,
             room=event.room.replace("_", " "),
-            activity=event.activity if name == event.person else f"{event.person} is {event.activity}",
-            others="".join(f"{other} and " for other in others),
-            needs=" ".join(needs),
+            activity=_unended(
+                event.activity if name == event.person else f"{event.person} is {event.activity}"
+            ),
+            others=" and ".join((*others, "the robot")),
+            needs=" ".join(f"{_unended(need)}." for need in needs),
             rooms=scene.within((event.room, *person.rooms)).told(),
         )
         answer = await self._speak(system, turns, seed, PersonTurn)
         return DialogueTurn(speaker=name, act=Act(answer.act), text=answer.text)
 
     async def robot_turn(
-        self, scene: SceneKinds, turns: Sequence[DialogueTurn], seed: int, *, is_last: bool
+        self,
+        scene: SceneKinds,
+        event: EventAnswer,
+        turns: Sequence[DialogueTurn],
+        seed: int,
+        *,
+        is_last: bool,
     ) -> DialogueTurn:
-        """Return the next turn of the robot, which knows its skills and the furniture. Raise LlmError."""
-        system = ROBOT_SYSTEM.format(scene=scene.told(), last=LAST_TURN if is_last else "").rstrip()
+        """Return the next turn of the robot, which knows its skills, who is there, and the furniture. Raise LlmError."""
+        system = ROBOT_SYSTEM.format(
+            place=event.room.replace("_", " "),
+            people=" and ".join(filter(None, (event.person, event.other))),
+            scene=scene.told(),
+            last=LAST_TURN if is_last else "",
+        ).rstrip()
         answer = await self._speak(system, turns, seed, RobotTurn)
         return DialogueTurn(speaker=ROBOT, act=Act(answer.act), text=answer.text)
 
@@ -226,6 +252,11 @@ class SocialModelAgents:
     def _request(self, purpose: str, system: str, user: str, seed: int, temperature: float) -> ChatRequest:
         messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))
         return ChatRequest(purpose, messages, self._max_tokens, temperature, seed)
+
+
+def _unended(sentence: str) -> str:
+    """Return a sentence without its full stop."""
+    return sentence.strip().removesuffix(".")
 
 
 def talk_of(turns: Sequence[DialogueTurn]) -> str:

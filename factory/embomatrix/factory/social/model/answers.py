@@ -12,7 +12,7 @@ from embomatrix.factory.social.wish import Wish
 
 PlainText = Annotated[str, Field(min_length=2, max_length=300, pattern=r"^[^\n<>{}]*$")]
 """Text without markup, which could end a section of a later prompt."""
-MAX_REQUESTS = 3
+MAX_REQUESTS = 4
 """Maximum number of requests in one dialogue."""
 
 
@@ -52,7 +52,7 @@ class EventAnswer(StrictModel):
     person: str
     room: str
     activity: PlainText
-    needs: tuple[PlainText, ...] = Field(min_length=1, max_length=MAX_REQUESTS)
+    needs: tuple[PlainText, ...] = Field(min_length=1, max_length=3)
     other: str = ""
     other_need: str = Field("", max_length=300, pattern=r"^[^\n<>{}]*$")
 
@@ -70,7 +70,7 @@ class DayAnswer(StrictModel):
 class PersonTurn(StrictModel):
     """Turn of a person."""
 
-    act: Literal["need", "answer", "amend", "add"]
+    act: Literal["need", "answer", "amend", "add", "thanks"]
     text: PlainText
 
 

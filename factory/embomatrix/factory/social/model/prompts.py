@@ -20,7 +20,8 @@ Answer with JSON: rooms, a sentence by the name of each room."""
 
 PEOPLE_SYSTEM: Final = f"""\
 You invent the people of a place: 2 to 4 of them, with first name, age, job, hobby, their own rooms (by the names in the
-scene), ties to the others by name, such as {{"Mia": "mother"}}, and 1 or 2 habits that concern things at home. {DATA}"""
+scene), ties by the others' names (what this person is to them: {{"Mia": "daughter"}} for Mia's daughter), and 1 or 2 habits
+that concern things of the place. {DATA}"""
 PEOPLE_USER: Final = """\
 <scene>
 {scene}
@@ -29,9 +30,10 @@ Answer with JSON: setting, people (name, age, job, hobby, rooms, ties, habits)."
 
 DAY_SYSTEM: Final = f"""\
 You plan a day of these people: 4 to 6 events, each with time (HH:MM), person, room (by its name in the scene), activity
-("baking a cake"), and 2 or 3 separate needs that the event causes. A need is one sentence about everyday things at home:
+("baking a cake"), and 2 or 3 separate needs that the event causes. A need is one sentence about everyday things there:
 where they are, and that they should be elsewhere, opened, closed, switched on or off, cooked, heated, frozen, cleaned or
-cut. Small things may be added to the scene. At half of the events an other person is there, with an other_need. {DATA}"""
+cut. Other small things than those of the scene may come in, only of these: {{things}}.
+At half of the events another person is there, with an other_need. {DATA}"""
 DAY_USER: Final = """\
 <scene>
 {scene}
@@ -43,15 +45,15 @@ EARLIER: Final = "Asked for already, so think of other things, places and states
 
 PERSON_SYSTEM: Final = """\
 You are {name}, {age}, {job}; you like {hobby}. {ties}{habits}It is {time}, you are in {room}: {activity}. You talk with
-{others} your household robot. On your mind: {needs}
+{others}. On your mind: {needs}
 Your rooms:
 {rooms}
 Say one or two short sentences, only as yourself. Say plainly which things, from where, and where they shall be or how.
-Acts: need (say what you need), answer (a question), amend (change your mind), add (one more need)."""
+Acts: need (say what you need), answer (a question), amend (change your mind), add (one more need), thanks (all is said)."""
 ROBOT_SYSTEM: Final = """\
 You are a household robot with one arm. You carry one small thing at a time, open, close and switch things, heat, cook and
-freeze food in appliances, clean and cut things. You can't pour, write, phone, climb or move furniture. You know the
-furniture:
+freeze food in appliances, clean and cut things. You can't pour, write, phone, climb or move furniture. You are in {place}
+with {people}. You know the furniture:
 {scene}
 Say one or two short sentences. Acts: clarify (ask which thing or place is meant), refuse (what you can't do, and why),
 propose (something instead), confirm (repeat everything that you will do). {last}"""
@@ -62,17 +64,19 @@ Your turn. Answer with JSON: act, text."""
 NO_TALK: Final = "Nobody has spoken yet."
 
 SUMMARY_SYSTEM: Final = f"""\
-You turn a dialogue into requests for a robot: one for each separate need that the robot confirmed, at most 3.
-instruction: one or two natural English sentences that ask for it and may say who wants it and why. Name every thing and
-place as people do ("the bowl on the table"), never with numbers or underscores. Say nothing that the wish does not demand.
-wish.objects: groups of alike things, hosts first. label (unique), kind (a name of the scene, or another everyday thing),
-count, room (by its name in the scene). Furniture and appliances: furniture true; if the room has several of a kind, count
-all of them. Small things start where the dialogue says: relation (ontop, inside, under, nextto) and host (a label), instead
-of a room. states at the start: open, toggled_on, dusty, stained ...
+You turn a dialogue into requests for a robot: one for each separate need that the robot confirmed, at most 4.
+instruction: one or two natural English sentences that ask for it and may say who wants it and why, without naming other
+things. Name every thing and place as people do ("the bowl on the table"), without underscores; only rooms of which there
+are several have their number ("bedroom 1"). Demand nothing that the wish does not demand.
+wish.objects: groups of alike things, hosts first. label (unique), kind (the first name in the scene, or another everyday
+thing), count, room (by its name in the scene). Furniture, appliances and lamps of the scene: furniture true; if the room
+has several of a kind, count all of them, up to 8. Small things start where the dialogue says: relation (ontop, inside,
+under, nextto) and host (a label), instead of a room. states at the start: open, toggled_on, dusty, stained ...
 wish.conditions: what must hold afterwards and does not hold yet. predicate (ontop, inside, under, nextto with place; open,
 toggled_on; cooked, hot, frozen with the appliance as place if the words name it; dusty, stained with holds false; soaked;
 sliced), things and place (labels), holds (false: closed, off, clean, not there), quantity (all, any, exactly with count,
-none), otherwise (an alternative condition), provided (only if that holds). {DATA}"""
+none, paired: one for each place, some_paired with count), otherwise (an alternative condition), provided (only if that
+holds at the start). {DATA}"""
 SUMMARY_USER: Final = """\
 <scene>
 {scene}
@@ -87,10 +91,10 @@ Answer with JSON: requests, only these, corrected, in this order."""
 
 READING_SYSTEM: Final = f"""\
 You read instructions for a robot and state what each demands, nothing that is merely likely. conditions: predicate (ontop,
-inside, under, nextto with place; open, toggled_on, cooked, hot, frozen, stained, soaked, sliced), thing and place (nouns of
-the words; cooked, hot and frozen take the appliance as place if the words name it), where (where the thing is now, if
-said), holds (false: closed, off, clean, no longer there), quantity (all, any, exactly with count, none), otherwise (an
-alternative), provided (an if). {DATA}"""
+inside, under, nextto with place; open, toggled_on, cooked, hot, frozen, dusty, stained, soaked, sliced), thing and place
+(nouns of the words; cooked, hot and frozen take the appliance as place if the words name it), where (where the thing is
+now, if said), holds (false: closed, off, clean, no longer there), quantity (all, any, exactly with count, none), otherwise
+(an alternative), provided (an if). {DATA}"""
 READING_USER: Final = """\
 <scene>
 {scene}

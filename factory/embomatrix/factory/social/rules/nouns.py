@@ -151,8 +151,10 @@ def names_of(kind: str) -> frozenset[str]:
 
 
 def named(noun: str) -> str:
-    """Return the kind with exactly this name, preferably one in use; "" if there is none."""
+    """Return the kind with exactly this name, preferably the catalog's own and one in use; "" if there is none."""
     words = noun.strip().lower().replace("_", " ")
+    if (own := words.replace(" ", "_")) in _kinds():
+        return own
     found = sorted(
         kind
         for single in singulars(words)

@@ -53,8 +53,19 @@ _JOINT: Final = 2
 _STOPS: Final = frozenset(
     (*".,;:!?", "and", "then", "or", "but", "put", "is", "are", "open", "that", "which")
 )
+_ENDS: Final = frozenset(".;!?")
 _CLAUSE_ENDS: Final = frozenset((*".,;:!?", "and", "then", "but"))
 _ACTION: Final = re.compile(rf"\b(?:{ACTIONS})\b")
+_ASIDE: Final = (
+    (re.compile(r"\ball over\b"), "over"),
+    (re.compile(r"\bfrom (?:under|underneath|beneath|below|behind|inside)\b"), "from"),
+    (re.compile(r"\b(?:hanging|standing|wide) open\b"), "open"),
+    (re.compile(r" to (?:cook|eat|drink|read|write|sit|play) (?:in|with|from|on)\b"), ""),
+)
+"""Phrases whose words state no quantity, place or demand, with what remains of them."""
+_ASKS: Final = re.compile(
+    r"\b(?:please|could|can|would|will|wants?|needs?|likes?|asks?|must|should|shall|has to|have to|make sure|see|belongs?)\b"
+)
 _REASONS: Final = re.compile(
     r"[^.,;:!?]+(?= , so\b)|"
     r"\b(?:because|since|so that|so|as (?:she|he|they|it)|before|after|while|whenever|when|for|in case|until)\b[^.,;:!?]*"
@@ -116,7 +127,12 @@ class Reading:
         return " ".join(self.tokens[at : mention.start])
 
     def has_reason_at(self, mention: Mention) -> bool:
-        """True if the noun is part of a clause with the reason or the time of the request."""
+        """True if the noun is part of a clause or sentence with the reason or the time of the request."""
+        start = max((at + 1 for at in range(mention.start) if self.tokens[at] in _ENDS), default=0)
+        ends = (at for at in range(mention.end, len(self.tokens)) if self.tokens[at] in _ENDS)
+        sentence = " ".join(self.tokens[start : next(ends, len(self.tokens))])
+        if not (_ACTION.search(sentence) or _ASKS.search(sentence)):
+            return True
         text = " ".join(self.tokens)
         at = len(" ".join(self.tokens[: mention.start]))
         reasons = (match for match in _REASONS.finditer(text) if not _ACTION.search(match.group()))
@@ -128,6 +144,8 @@ def read(text: str, context: Sequence[str] = ()) -> Reading:
     lowered = text.lower()
     for phrase in sorted(filter(None, context), key=len, reverse=True):
         lowered = re.sub(rf"\b{re.escape(phrase.lower())}\b", "context", lowered)
+    for aside, left in _ASIDE:
+        lowered = aside.sub(left, lowered)
     tokens = tokens_of(lowered)
     mentions = mentions_in(tokens)
     return Reading(text, tokens, mentions, _plain(tokens, mentions))

@@ -67,6 +67,7 @@ _NARRATED: Final = re.compile(
     r"\b(?:finished|done|stopped|is|are|was|were|been|loves?|likes?|before|after|while|from|of) $"
 )
 _DETERMINER: Final = r"\b(?:the|a|an|those|these|all|each|every|my|his|her|our|their|any|\w+['’]s)"
+_ASSURED: Final = re.compile(r"\b(?:make sure|see to it|see that|ensure|check)\b")
 _DEFAULT_STATES: Final = frozenset({"clean", "cleaned", "closed", "shut", "wet"})
 """Adjectives that describe an object as it usually is. They demand nothing before a noun."""
 
@@ -98,8 +99,10 @@ def _is_adjective(text: str, match: re.Match[str], is_described: bool) -> bool:
     """True for a description of an object, as in *the open drawer*, that is its usual or its initial state."""
     if not (is_described or match.group() in _DEFAULT_STATES):
         return False
-    before = re.search(rf"(?:{_DETERMINER}|is|are|still) $", text[: match.start()])
-    return before is not None
+    told = text[: match.start()]
+    if not is_described and _ASSURED.search(re.split(r"[.;!?]", told)[-1]):
+        return re.search(rf"{_DETERMINER} $", told) is not None  # *make sure that it is closed* demands it
+    return re.search(rf"(?:{_DETERMINER}|is|are|still) $", told) is not None
 
 
 def _is_narrated(text: str, match: re.Match[str]) -> bool:

@@ -63,12 +63,19 @@ def _too_many(wish: Wish, scene: SceneKinds) -> Iterator[Fault]:
     if movable > MAX_MOVABLE:
         yield Fault(FaultKind.TOO_MANY, f"the wish has {movable} objects: use at most {MAX_MOVABLE}")
     for group in wish.objects:
-        there = scene.furniture.get((group.kind, group.room), 0)
+        room = _room_of(group, wish)
+        there = sum(each.count for each in scene.alike(group.kind, room))
         if group.furniture and group.count > max(1, there):
             yield Fault(
                 FaultKind.TOO_MANY,
-                f"{group.label}: {group.room} has {there} of {group.kind}, the wish takes {group.count}",
+                f"{group.label}: {room} has {there} of {group.kind}, the wish takes {group.count}",
             )
+
+
+def _room_of(group: WishedObjects, wish: Wish) -> str:
+    while group.host:
+        group = wish.groups[group.host]
+    return group.room
 
 
 def _start_faults(group: WishedObjects, wish: Wish) -> Iterator[Fault]:
@@ -78,7 +85,8 @@ def _start_faults(group: WishedObjects, wish: Wish) -> Iterator[Fault]:
     if not group.furniture and not able.is_portable:
         yield Fault(
             FaultKind.NOT_PORTABLE,
-            f"{group.label}: a {group.kind} can't be carried: set furniture to true to take it from the scene",
+            f"{group.label}: a {group.kind} can't be carried: set furniture to true if the room has one, or choose "
+            "something smaller",
         )
     if group.relation is not None:
         yield from _hosting(group, WishPredicate(group.relation.value), wish.groups[group.host])
