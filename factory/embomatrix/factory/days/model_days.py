@@ -139,6 +139,7 @@ def _also_meant(view: SceneView, task: Task, names: Sequence[str]) -> str:
 
 
 def _place_words(view: SceneView, name: str) -> tuple[str, ...]:
-    """Return the noun of the support and of the room of an object."""
-    host, room = view.item(name).host, view.room(name).rpartition("_")[0].replace("_", " ")
-    return (room, *((noun_of(view.category(host)).one,) if host else ()))
+    """Return the noun of the support of an object, and its room by type and by name."""
+    host, room = view.item(name).host, view.room(name)
+    rooms = (room.rpartition("_")[0].replace("_", " "), room.replace("_", " "))
+    return (*rooms, *((noun_of(view.category(host)).one,) if host else ()))
