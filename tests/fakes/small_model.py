@@ -54,7 +54,7 @@ async def ask_everything(model):
         "people": lambda: agents.people(kinds, 0),
         "plan_day": lambda: agents.plan_day(kinds, HOUSEHOLD, (), 0),
         "person_turn": lambda: agents.person_turn(kinds, HOUSEHOLD, EVENT, "Ann", (), 0),
-        "robot_turn": lambda: agents.robot_turn(kinds, TALK[:3], 0, is_last=True),
+        "robot_turn": lambda: agents.robot_turn(kinds, EVENT, TALK[:3], 0, is_last=True),
         "summarise": lambda: agents.summarise(kinds, TALK, 0),
         "demands": lambda: agents.demands(kinds, ["Please put the apple in the fridge."], 0),
     }

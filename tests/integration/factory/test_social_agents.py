@@ -47,7 +47,12 @@ def test_scene_facts_list_the_rooms() -> None:
 
 def test_language_model_plays_the_people_on_request() -> None:
     cast = SOCIAL_AGENTS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
-    people = {"setting": cast.setting, "people": [person.model_dump() for person in cast.people]}
+    told = [
+        # A model says what the others are to a person; a person's ties are what the person is to the others.
+        {**each.model_dump(), "ties": {o.name: o.ties[each.name] for o in cast.people if each.name in o.ties}}
+        for each in cast.people
+    ]
+    people = {"setting": cast.setting, "people": told}
     events = [{**slot.model_dump(), "needs": ["The cup should be on the table."]} for slot in cast.day[:3]]
     with ChatServer("no", json.dumps(people), json.dumps({"events": events})).serving() as url:
         found = run("role-player", BRIEF, "--llm", url, "--model", "small-1")

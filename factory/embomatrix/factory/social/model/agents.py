@@ -130,7 +130,7 @@ class SocialModelAgents:
                     )
 
         people = "\n".join(
-            f"{each.name}, {each.age}, {each.job}, likes {each.hobby}; {' '.join(household.habits[each.name])}"
+            f"{each.name}, {each.age}, {each.job}, likes {each.hobby}; {'; '.join(household.habits[each.name])}"
             for each in household.people
         )
         told = "\n".join(f"- {line}" for line in earlier[-LISTED_EARLIER:])

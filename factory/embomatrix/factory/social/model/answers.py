@@ -31,11 +31,12 @@ class PersonAnswer(StrictModel):
     hobby: PlainText
     rooms: tuple[str, ...] = ()
     ties: dict[str, str] = Field(default_factory=dict)
+    """What each of the others is to this person."""
     habits: tuple[PlainText, ...] = Field((), max_length=3)
 
-    def person(self) -> Person:
-        """Return the person without the habits."""
-        return Person(**self.model_dump(exclude={"habits"}))
+    def person(self, ties: Mapping[str, str]) -> Person:
+        """Return the person without the habits. ``ties`` are what this person is to the others."""
+        return Person(**self.model_dump(exclude={"habits", "ties"}), ties=dict(ties))
 
 
 class PeopleAnswer(StrictModel):
@@ -111,9 +112,8 @@ class Household:
     @staticmethod
     def of(answer: PeopleAnswer) -> "Household":
         """Return the household of an answer. Raise ValueError for a tie to a stranger or for equal names."""
-        people = tuple(each.person() for each in answer.people)
-        names = [person.name for person in people]
-        for person in people:
+        names = [person.name for person in answer.people]
+        for person in answer.people:
             strangers = sorted(set(person.ties) - (set(names) - {person.name}))
             if strangers:
                 raise ValueError(
@@ -121,6 +121,11 @@ class Household:
                 )
         if len(set(names)) < len(names) or any(name.lower() == ROBOT for name in names):
             raise ValueError(f"names must be unique and not {ROBOT!r}, found {', '.join(names)}")
+        told = {each.name: each.ties for each in answer.people}
+        people = tuple(
+            each.person(ties={other: told[other][each.name] for other in told if each.name in told[other]})
+            for each in answer.people
+        )
         return Household(answer.setting, people, {each.name: each.habits for each in answer.people})
 
     def person(self, name: str) -> Person:

@@ -20,8 +20,8 @@ Answer with JSON: rooms, a sentence by the name of each room."""
 
 PEOPLE_SYSTEM: Final = f"""\
 You invent the people of a place: 2 to 4 of them, with first name, age, job, hobby, their own rooms (by the names in the
-scene), ties by the others' names (what this person is to them: {{"Mia": "daughter"}} for Mia's daughter), and 1 or 2 habits
-that concern things of the place. {DATA}"""
+scene), ties (what each of the others is to this person: {{"Mia": "mother"}} if Mia is the mother), and 1 or 2 habits that
+concern things of the place. {DATA}"""
 PEOPLE_USER: Final = """\
 <scene>
 {scene}
@@ -30,10 +30,10 @@ Answer with JSON: setting, people (name, age, job, hobby, rooms, ties, habits)."
 
 DAY_SYSTEM: Final = f"""\
 You plan a day of these people: 4 to 6 events, each with time (HH:MM), person, room (by its name in the scene), activity
-("baking a cake"), and 2 or 3 separate needs that the event causes. A need is one sentence about everyday things there:
-where they are, and that they should be elsewhere, opened, closed, switched on or off, cooked, heated, frozen, cleaned or
-cut. Other small things than those of the scene may come in, only of these: {{things}}.
-At half of the events another person is there, with an other_need. {DATA}"""
+("baking a cake"), and 2 separate needs that the event causes, 3 if nobody else is there. A need is one sentence about
+everyday things there: where they are, and that they should be elsewhere, opened, closed, switched on or off, cooked, heated,
+frozen, cleaned or cut. Other small things than those of the scene may come in, only of these: {{things}}.
+At half of the events another person is there (other), with an other_need. {DATA}"""
 DAY_USER: Final = """\
 <scene>
 {scene}
@@ -71,12 +71,12 @@ are several have their number ("bedroom 1"). Demand nothing that the wish does n
 wish.objects: groups of alike things, hosts first. label (unique), kind (the first name in the scene, or another everyday
 thing), count, room (by its name in the scene). Furniture, appliances and lamps of the scene: furniture true; if the room
 has several of a kind, count all of them, up to 8. Small things start where the dialogue says: relation (ontop, inside,
-under, nextto) and host (a label), instead of a room. states at the start: open, toggled_on, dusty, stained ...
+under, nextto) and host (a label), instead of a room. states at the start: open, toggled_on, dusty, stained (dirty) ...
 wish.conditions: what must hold afterwards and does not hold yet. predicate (ontop, inside, under, nextto with place; open,
 toggled_on; cooked, hot, frozen with the appliance as place if the words name it; dusty, stained with holds false; soaked;
-sliced), things and place (labels), holds (false: closed, off, clean, not there), quantity (all, any, exactly with count,
-none, paired: one for each place, some_paired with count), otherwise (an alternative condition), provided (only if that
-holds at the start). {DATA}"""
+sliced), things and place (labels), holds (false: closed, off, clean, not there), quantity (all, any: one of them, exactly
+with count, none, paired: one for each place, some_paired with count), otherwise (an alternative condition), provided (only
+if that holds at the start). {DATA}"""
 SUMMARY_USER: Final = """\
 <scene>
 {scene}

@@ -170,8 +170,17 @@ class InstructionRules:
         for condition in self._wish.conditions:
             group = self._groups[condition.things]
             mentions = self._mentions_of(group)
+            if self._counts_pronoun(condition):
+                continue
             if mentions and not any(_is_counted(condition, group, each, self._reading) for each in mentions):
                 yield Fault(FaultKind.WRONG_COUNT, _count_sentence(condition, group))
+
+    def _counts_pronoun(self, condition: Condition) -> bool:
+        """True for an exact number of *them*: *her two plants: move exactly one of them*."""
+        if condition.quantity is not Quantity.EXACTLY:
+            return False
+        found = re.search(r"\b(\w+) of them\b", self._reading.plain)
+        return found is not None and NUMBERS.get(found[1]) == condition.count
 
     def _wrong_rooms(self) -> Iterator[Fault]:
         told = {self._room_of(group) for group in self._wish.objects} | self._own_rooms

@@ -13,6 +13,8 @@ from embomatrix.world.state import State
 
 MIN_HOST_M: Final = 0.05
 """Minimum extents of a surface or a cavity that holds anything."""
+SMALLEST_SHARE: Final = 0.5
+"""Smallest scale of a model in a layout."""
 MAX_MODELS: Final = 12
 """Number of models of a kind that are examined."""
 
@@ -41,7 +43,7 @@ class KindAbilities:
 def abilities_of(kind: str) -> KindAbilities:
     """Return the abilities of a kind. Raise CatalogError for an unknown one."""
     assets = _assets(kind)
-    portable = [asset for asset in assets if is_liftable(asset.size_m, asset.mass_kg)]
+    portable = [asset for asset in assets if _is_liftable_scaled(asset)]
     smallest = min((portable or list(assets)), key=lambda asset: sorted(asset.size_m))
     low, middle, high = sorted(smallest.size_m)
     surfaces = {_sorted_pair(surface.size_m) for asset in assets for surface in asset.open_supports}
@@ -55,6 +57,12 @@ def abilities_of(kind: str) -> KindAbilities:
         cavities_m=tuple(sorted(triple for triple in cavities if triple[0] >= MIN_HOST_M)),
         smallest_m=(low, middle, high),
     )
+
+
+def _is_liftable_scaled(asset: Asset) -> bool:
+    """True if the robot lifts the model at the smallest scale that a layout uses."""
+    width, depth, height = (extent * SMALLEST_SHARE for extent in asset.size_m)
+    return is_liftable((width, depth, height), asset.mass_kg * SMALLEST_SHARE**3)
 
 
 @functools.cache

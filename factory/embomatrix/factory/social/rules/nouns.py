@@ -51,7 +51,7 @@ NOT_OBJECTS: Final = frozenset(
         "can", "may", "will", "like", "well", "back", "top", "side", "front", "middle", "bottom", "light", "order",
         "use", "water", "minute", "second", "hand", "home", "house", "room", "family", "child", "cook", "watch",
         "iron", "cover", "match", "post", "present", "fan", "step", "square", "face", "cut", "slice", "half",
-        "it", "stand", "door", "lid", "handle", "button", "switch",
+        "it", "up", "off", "stand", "door", "lid", "handle", "button", "switch",
         "meal", "dinner", "breakfast", "lunch", "supper", "background", "address", "air", "heat",
     )
 )  # fmt: skip

@@ -61,6 +61,13 @@ _ASIDE: Final = (
     (re.compile(r"\bfrom (?:under|underneath|beneath|below|behind|inside)\b"), "from"),
     (re.compile(r"\b(?:hanging|standing|wide) open\b"), "open"),
     (re.compile(r" to (?:cook|eat|drink|read|write|sit|play) (?:in|with|from|on)\b"), ""),
+    (re.compile(r"\bgo(?:es)? off\b"), "spoil"),
+    (
+        re.compile(
+            r"\ba (?:good |quick |thorough |proper )?(?:clean|wash|wipe|scrub)(?=[.,;:!?]| and| for| please|$)"
+        ),
+        "cleaning",
+    ),
 )
 """Phrases whose words state no quantity, place or demand, with what remains of them."""
 _ASKS: Final = re.compile(
@@ -68,6 +75,7 @@ _ASKS: Final = re.compile(
 )
 _REASONS: Final = re.compile(
     r"[^.,;:!?]+(?= , so\b)|"
+    r"\bto (?:have|drink|eat|enjoy|read|start|begin)\b[^.,;:!?]*|"
     r"\b(?:because|since|so that|so|as (?:she|he|they|it)|before|after|while|whenever|when|for|in case|until)\b[^.,;:!?]*"
 )
 """Clause with the reason or the time of a request."""
@@ -85,8 +93,11 @@ class Reading:
     def before(self, mention: Mention, words: int) -> tuple[str, ...]:
         """Return up to this many words before the noun, not beyond a stop of the clause."""
         found: list[str] = []
-        for token in reversed(self.tokens[: mention.start]):
-            if token in _STOPS or len(found) == words:
+        for at in range(mention.start - 1, -1, -1):
+            token = self.tokens[at]
+            # *Into the open drawer* goes on, *is open, the drawer* ends.
+            is_adjective = token == "open" and at > 0 and self.tokens[at - 1] in ("the", "a", "an")
+            if (token in _STOPS and not is_adjective) or len(found) == words:
                 break
             found.insert(0, token)
         return tuple(found)
@@ -98,7 +109,7 @@ class Reading:
         first = min((mention.start for mention in mentions), default=len(self.tokens))
         for at in range(first, len(self.tokens)):
             if self.tokens[at] in _PRONOUNS:
-                yield from _relations(self.tokens[max(0, at - 2) : at])
+                yield from _relations(self.tokens[max(0, at - 3) : at])
         if any(token == "inside" for token in self.tokens[first:]):
             yield WishPredicate.INSIDE
 

@@ -105,11 +105,16 @@ def _raw_names(text: str) -> Iterator[Fault]:
             return
 
 
+def _noun_from(text: str, match: re.Match[str]) -> str:
+    """Return the capitalised word and the one after it: *Eames chair* is no person."""
+    return " ".join(text[match.start(1) :].lower().split()[:2]).rstrip(".,;:!?")
+
+
 def _unknown_people(text: str, people: frozenset[str]) -> Iterator[Fault]:
     parts = {part for name in people for part in name.split()}
     for match in (*_SUBJECT.finditer(text), *_NAME.finditer(text)):
         name = match[1]
-        if name not in parts | _NO_NAMES:
+        if name not in parts | _NO_NAMES and not kinds_called(_noun_from(text, match)):
             known = ", ".join(sorted(people))
             yield Fault(FaultKind.UNKNOWN_PERSON, f"nobody here is called {name}: the people are {known}")
             return

@@ -44,7 +44,7 @@ DEMANDS: Final[Mapping[StatedDemand, str]] = {
 
 _DEMANDING_PLACE: Final = (
     r"put|place|bring|move|carry|take|store|stow|stack|lay|drop|return|"
-    r"tidy|fetch|tuck|load|transfer|pack|collect"
+    r"tidy|fetch|tuck|load|transfer|pack|collect|throw"
 )
 """Verbs that demand a place."""
 ACTIONS: Final = (
@@ -55,7 +55,7 @@ ACTIONS: Final = (
 """Verbs that an instruction may begin with."""
 OTHER_WORK: Final = (
     r"call|phone|ring|pour|vacuum|hoover|mop|iron|sew|paint|write|read|sing|play|feed|repair|fix|buy|order|shop|drive|"
-    r"walk|dance|talk|tell|say|mix|stir|fold|assemble|fill|water|assist|attach|hug|kill|burn|break|smash|throw"
+    r"walk|dance|talk|tell|say|mix|stir|fold|assemble|fill|water|assist|attach|hug|kill|burn|break|smash"
 )
 """Verbs of work that the robot does not do."""
 NEGATION: Final = (
@@ -64,7 +64,7 @@ NEGATION: Final = (
 )
 """Words that turn a demand into its contrary."""
 _NARRATED: Final = re.compile(
-    r"\b(?:finished|done|stopped|is|are|was|were|been|loves?|likes?|before|after|while|from|of) $"
+    r"\b(?:finished|done|stopped|starts?|starting|begins?|busy|is|are|was|were|been|loves?|likes?|before|after|while|from|of) $"
 )
 _DETERMINER: Final = r"\b(?:the|a|an|those|these|all|each|every|my|his|her|our|their|any|\w+['’]s)"
 _ASSURED: Final = re.compile(r"\b(?:make sure|see to it|see that|ensure|check)\b")

@@ -147,7 +147,10 @@ def _hosting(guest: WishedObjects, predicate: WishPredicate, host: WishedObjects
         return
     if host.label == guest.label or not able.takes(small, inside=inside):
         room = "inside" if inside else "on top"
-        yield Fault(FaultKind.NO_HOST, f"{host.label}: a {host.kind} has no room for a {guest.kind} {room}")
+        yield Fault(
+            FaultKind.NO_HOST,
+            f"{host.label}: a {host.kind} has no room for a {guest.kind} {room}: choose another place",
+        )
 
 
 def _held(condition: Condition, wish: Wish, scene: SceneKinds) -> Iterator[Fault]:
