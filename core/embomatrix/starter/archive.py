@@ -41,7 +41,7 @@ class Recipe:
 
 
 RECIPE: Final = Recipe(
-    train=640,
+    train=480,
     heldout=120,
     seed=0,
     scenes=(
