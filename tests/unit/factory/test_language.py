@@ -144,3 +144,49 @@ def test_quantities_have_words_of_their_own_number() -> None:
     assert all_of(words, mugs, 2).words.split()[-3:] == ["on", "the", "table"]
     assert any_of(words, mugs, 2).count == 1
     assert "one" in exactly(words, mugs, 1, 2).words
+
+
+def sentences(clause: Clause, split: str = "heldout") -> list[str]:
+    return [sentence_of(clause, PhraseBook(split, 0), voice(seed), Speaker()) for seed in range(120)]
+
+
+def test_a_place_of_the_thing_and_a_place_to_put_it_are_kept_apart() -> None:
+    told = sentences(Clause("ontop", NounPhrase("the mugs on one of the desks", 2), "the table"))
+    requests = [text for text in told if "from one of the desks" in text]
+    assert requests
+    assert not [
+        text for text in told if re.search(r"\b(put|lay|set|place) the mugs on one of the desks on", text)
+    ]
+    assert "move the mugs from one of the desks to the table" in " ".join(told).lower()
+    # A floor under a table would be another place.
+    assert not [text for text in sentences(Clause("under", NounPhrase("the shoes on the floor", 2), "the table"))
+                if "from the floor under" in text]  # fmt: skip
+
+
+def test_any_of_several_is_asked_for_and_never_stated() -> None:
+    for text in sentences(Clause("ontop", NounPhrase("any book on the bookcase"), "the table")):
+        assert not re.match("any ", text, re.IGNORECASE), (
+            text
+        )  # *any book must be on the table* may mean every book
+
+
+def test_gerunds_join_gerunds() -> None:
+    told = " ".join(sentences(Clause("under", NounPhrase("the bag in bedroom 0"), "the table")))
+    assert "taking the bag from bedroom 0 and putting it under the table" in told
+    assert "and put it under" in told
+
+
+def test_plural_nouns_and_kinds_without_a_singular_are_never_told_one_by_one() -> None:
+    rows = [PromptRow(at, f"jeans_{at}", "jeans", "bedroom_0", "bed_1", Relation.ONTOP) for at in range(3)]
+    rows += [PromptRow(5 + at, f"mug_{at}", "mug", "kitchen_0", "table_1", Relation.ONTOP) for at in range(3)]
+    for seed in range(60):
+        teller = Describer(
+            {row.name: row for row in rows}, ["kitchen_0", "bedroom_0"], voice(seed), "heldout"
+        )
+        for names in (["jeans_0", "jeans_1", "jeans_2"], ["mug_0", "mug_1", "mug_2"]):
+            found = teller.describe(names)
+            assert found is not None
+            words = all_of(teller, found, 3).words
+            assert not words.startswith(("every jeans", "every thing", "each thing")), words
+        single = teller.describe(["mug_0"])
+        assert single is None or "thing to drink from" not in teller.phrase(single, 1)

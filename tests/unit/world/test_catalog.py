@@ -121,6 +121,8 @@ def test_every_category_has_a_mass_and_a_model(catalog: Catalog) -> None:
         (lambda c: c.inventory("Rs_in"), "Rs_int"),
         (lambda c: c.categories_of("aple.n.01"), "apple.n.01"),
         (lambda c: c.synset_of("qqqqqqq"), "for example"),
+        (lambda c: c.synset_of("bread"), "bread_slice"),
+        (lambda c: c.synset_of("towel"), "hand_towel"),
     ],
 )
 def test_unknown_name_error_suggests_close_matches(catalog: Catalog, ask, said: str) -> None:
