@@ -9,7 +9,7 @@ from functools import partial
 from typing import Final
 
 from embomatrix.factory.admission import SEED, RefusalReason, TaskRefusal
-from embomatrix.factory.days.planning import PlanDay, PlannedDay, day_name, plan_day
+from embomatrix.factory.days.planning import MOST_ALIKE, PlanDay, PlannedDay, day_name, plan_day
 from embomatrix.factory.pipeline.build import Making
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.store import Rejection, VariantResult, VariantYield
@@ -82,7 +82,9 @@ TASKS_PER_DAY: Final = 2
 """Number of tasks that a day should yield. With the analysis of the arm and the proof in physics, many needs drop out."""
 MOST_OF_CATEGORY: Final = 0.5
 """Largest share of a category: the needs of people are not the same number in each."""
-DAYS: Final = Making(DayMaker, whole_scenes=True, tasks=TASKS_PER_DAY, most=MOST_OF_CATEGORY)
+DAYS: Final = Making(
+    DayMaker, whole_scenes=True, tasks=TASKS_PER_DAY, most=MOST_OF_CATEGORY, alike=MOST_ALIKE
+)
 """Making of days in whole scenes."""
 
 

@@ -39,6 +39,8 @@ HELD_OUT_SHAPES: Final = 5
 """One in this many goal shapes with several conditions belongs to the held-out split."""
 HELD_OUT_NEEDS: Final = 5
 """One in this many needs belongs to the held-out split."""
+MOST_ALIKE: Final = 1
+"""Maximum number of tasks with one kind of goal in a base scene: the same wish in other words is no new task."""
 RARE: Final = frozenset(
     {
         WishPredicate.UNDER,
@@ -102,7 +104,7 @@ def plan_day(
     writer = DraftWriter(laid_out, cast, order.split, seed, FreshVoice(rng, Counter()))
     day, refusals = _met(laid_out, writer)
     tasks: list[PlannedTask] = []
-    known = set(order.known)
+    known, alike = set(order.known), Counter(order.alike)
     for number, combination in enumerate(combinations_of(day, rng)):
         if order.split == "train" and is_held_out_shape(combination, seed):
             continue
@@ -111,8 +113,12 @@ def plan_day(
             kinds = ", ".join(need.need.name for need in combination.needs)
             reason = f"no description distinguishes the objects of {kinds} from others in the table"
             refusals.append(TaskRefusal(RefusalReason.UNFAITHFUL, reason))
-        elif (key := uniqueness_key(planned.draft.signature, planned.draft.task.instruction)) not in known:
+            continue
+        signature = planned.draft.signature
+        key = uniqueness_key(signature, planned.draft.task.instruction)
+        if key not in known and alike[signature] < MOST_ALIKE:
             known.add(key)
+            alike[signature] += 1
             tasks.append(planned)
     return PlannedDay(day.scene, tuple(tasks), tuple(refusals))
 

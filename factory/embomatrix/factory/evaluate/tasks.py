@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import zlib
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,22 +113,23 @@ class DraftFeatures:
     quantified: bool
 
 
-WriteDrafts = Callable[[Scene, int, int], Iterator[Draft]]
-"""Writer of unproved drafts for the n-th variant or day of a base scene, with a seed."""
+WriteDrafts = Callable[[Scene, int, int, Mapping[str, int]], Iterator[Draft]]
+"""Writer of unproved drafts for the n-th variant or day of a base scene, with a seed and the tasks of each kind of goal."""
 
 
 def asked_in(base: Scene, write: WriteDrafts, count: int, seed: int) -> list[DraftFeatures]:
     """Return up to ``count`` different tasks over variants or days of a base scene."""
     found: dict[str, DraftFeatures] = {}
     for number in range(MOST_VARIANTS):
-        for draft in write(base, number, seed):
+        alike = Counter(each.signature for each in found.values())
+        for draft in write(base, number, seed, alike):
             found.setdefault(uniqueness_key(draft.signature, draft.task.instruction), _features(draft))
             if len(found) == count:
                 return list(found.values())
     return list(found.values())
 
 
-def plain_drafts(base: Scene, number: int, seed: int) -> Iterator[Draft]:
+def plain_drafts(base: Scene, number: int, seed: int, _alike: Mapping[str, int]) -> Iterator[Draft]:
     """Yield drafts of the plain writer about small objects, cycling through the task categories."""
     sequence = np.random.SeedSequence((seed, zlib.crc32(base.base.encode()), number))
     rng = np.random.default_rng(sequence)
@@ -146,10 +148,11 @@ def plain_drafts(base: Scene, number: int, seed: int) -> Iterator[Draft]:
             return
 
 
-def society_drafts(base: Scene, number: int, seed: int) -> Iterator[Draft]:
+def society_drafts(base: Scene, number: int, seed: int, alike: Mapping[str, int]) -> Iterator[Draft]:
     """Yield the drafts of one day of the people of a base scene."""
     rooms = tuple(room.name for room in base.rooms)
-    order = VariantOrder("heldout", number, base.base, rooms, dict.fromkeys(TaskCategory, 1), frozenset())
+    missing = dict.fromkeys(TaskCategory, 1)
+    order = VariantOrder("heldout", number, base.base, rooms, missing, frozenset(), alike)
     planned = plan_day(order, base, seed)
     if not isinstance(planned, TaskRefusal):
         yield from planned.drafts

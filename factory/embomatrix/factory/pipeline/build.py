@@ -139,13 +139,14 @@ class Making:
 
     If ``whole_scenes``, the held-out tasks lie in scenes of their own, otherwise in rooms of their own. ``tasks`` is the
     number of tasks that a variant should yield. ``most`` is the largest share of a category; None makes
-    all categories equal.
+    all categories equal. ``alike`` is the largest number of tasks with one kind of goal in a base scene; None sets no limit.
     """
 
     begin: Callable[..., Maker]
     whole_scenes: bool = False
     tasks: int = TASKS_PER_VARIANT
     most: float | None = None
+    alike: int | None = None
 
 
 def _make(maker: Maker, order: VariantOrder) -> VariantYield:
@@ -268,6 +269,7 @@ class _SplitOrders:
             category: _share(target, index) if making.most is None else math.ceil(target * making.most)
             for index, category in enumerate(TaskCategory)
         }
+        self._most_alike = making.alike
         self._end = VARIANTS_PER_FULL * (target // making.tasks + 1)
         self._number = 0
 
@@ -290,7 +292,9 @@ class _SplitOrders:
             self._number = numbers.stop
             made = {result.number for result in self._store.results if result.split == self._split}
             orders = [
-                VariantOrder(self._split, number, base, self._rooms[base], missing, known)
+                VariantOrder(
+                    self._split, number, base, self._rooms[base], missing, known, self._alike(base, number)
+                )
                 for number in numbers
                 if number not in made
                 for base in (self._usable[number % len(self._usable)],)
@@ -305,9 +309,17 @@ class _SplitOrders:
         left, known = self._missing(number), self._known(number)
         most = self._left(number)
         kept: list[TaskRecord] = []
+        alike = self._alike(self._usable[number % len(self._usable)], number)
         for record in variant.result.records:
-            if len(kept) < most and left[record.task.category] > 0 and _key(record) not in known:
+            is_common = self._most_alike is not None and alike[record.signature] >= self._most_alike
+            if (
+                len(kept) < most
+                and left[record.task.category] > 0
+                and _key(record) not in known
+                and not is_common
+            ):
                 left[record.task.category] -= 1
+                alike[record.signature] += 1
                 kept.append(record)
         names = {record.task.task_id for record in kept}
         kept_variant = dataclasses.replace(
@@ -332,6 +344,11 @@ class _SplitOrders:
 
     def _known(self, before: int) -> frozenset[str]:
         return frozenset(_key(record) for record in self._before(before))
+
+    def _alike(self, base: str, before: int) -> Counter[str]:
+        """Return the number of tasks of a base scene before this variant, by kind of goal."""
+        records = self._before(before) if self._most_alike is not None else ()
+        return Counter(record.signature for record in records if base_scene_of(record.task.scene_id) == base)
 
     def _before(self, number: int) -> Iterator[TaskRecord]:
         for result in self._store.results:

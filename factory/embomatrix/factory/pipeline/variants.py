@@ -6,7 +6,7 @@ import time
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -62,7 +62,10 @@ FOCUS_ROOMS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class VariantOrder:
-    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing tasks."""
+    """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing tasks.
+
+    ``alike`` counts the existing tasks of the base scene by the kind of their goal.
+    """
 
     split: str
     number: int
@@ -70,6 +73,7 @@ class VariantOrder:
     rooms: tuple[str, ...]
     missing: Mapping[TaskCategory, int]
     known: frozenset[str]
+    alike: Mapping[str, int] = field(default_factory=dict)
 
 
 class VariantMaker:
