@@ -61,7 +61,10 @@ RECIPE: Final = Recipe(
         "restaurant_diner",
     ),
 )
-"""Fourteen scenes; two of the ten homes are held out. The dataset that ships now is older: it is the first part of such a build."""
+"""Fourteen scenes; two of the ten homes are held out.
+
+The dataset that ships now is older, the first part of such a build.
+"""
 
 
 def content_digest(dataset: Dataset) -> str:
