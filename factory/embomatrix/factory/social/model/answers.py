@@ -31,7 +31,7 @@ class PersonAnswer(StrictModel):
     hobby: PlainText
     rooms: tuple[str, ...] = ()
     ties: dict[str, str] = Field(default_factory=dict)
-    """What each of the others is to this person."""
+    """Relation of each of the others to this person, such as ``mother``."""
     habits: tuple[PlainText, ...] = Field((), max_length=3)
 
     def person(self, ties: Mapping[str, str]) -> Person:
