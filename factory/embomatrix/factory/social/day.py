@@ -30,6 +30,8 @@ from embomatrix.world.state import Relation, State
 
 MAX_MISSING: Final = 1
 """Maximum number of furniture pieces that a wish may demand without the scene having them."""
+MAX_MISSING_IN_HALLS: Final = 2
+"""Halls are empty: people bring tables for what goes on there."""
 NEVER_ADDED: Final = frozenset({"countertop", "bar", "commercial_kitchen_table", "microwave"})
 """Kinds that are not added to a room: furniture built into other furniture, and appliances that stand on other furniture."""
 DECOY_SHARE: Final = 0.5
@@ -145,7 +147,10 @@ def wish_of(need: Need, view: SceneView, rng: np.random.Generator) -> tuple[Wish
         missing += lacks
         if lacks and group.kind in NEVER_ADDED:
             return None
-    if missing > MAX_MISSING or not _has_water(need, groups, view, rng):
+    is_hall = place_of(view.scene.base) == "hall"
+    if missing > (MAX_MISSING_IN_HALLS if is_hall else MAX_MISSING) or not _has_water(
+        need, groups, view, rng
+    ):
         return None
     groups = _with_doors(need, groups, rng)
     count = _count(need, groups, rng)
@@ -177,8 +182,14 @@ def _needs_no_door(part: GoalPart, groups: Mapping[str, WishedObjects]) -> bool:
 
 
 def _room(role: ObjectRole, view: SceneView, rng: np.random.Generator) -> str:
-    """Return a room of one of the role's types, preferring rooms with suitable furniture; "" if there is none."""
-    rooms = [room.name for room in view.scene.rooms if room.type in role.rooms]
+    """Return a room of one of the role's types, preferring rooms with suitable furniture; "" if there is none.
+
+    In halls, whose corridors are narrow, an unfurnished room is the largest one.
+    """
+    found = [room for room in view.scene.rooms if room.type in role.rooms]
+    if place_of(view.scene.base) == "hall":
+        found = sorted(found, key=lambda room: -room.size_m[0] * room.size_m[1])[:1]
+    rooms = [room.name for room in found]
     furnished = [name for name in rooms if _there(role, name, view)]
     options = furnished or rooms
     return options[int(rng.integers(len(options)))] if options else ""
