@@ -93,6 +93,7 @@ OWN: Final[Mapping[str, str]] = {
     "trainer.eai.inside.demo:simulator_names": PACKAGED,
     "cli.demo:_ensure_tasks": PACKAGED,
     "factory.commands.evaluate:_shipped": PACKAGED,
+    "factory.commands.corpus:corpus": PACKAGED,
     "factory.commands.starter:starter": PACKAGED,
     "world.catalog:_read": PACKAGED,
     "starter.archive:_unpacked": PACKAGED,

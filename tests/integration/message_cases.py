@@ -163,7 +163,7 @@ COMMANDS = (
         "apple_to_countr",
         "did you mean apple_to_counter?",
     ),
-    CommandCase("misspelt scene", "scene show Rs_imt", "Rs_imt", "did you mean Rs_int?"),
+    CommandCase("misspelt scene", "scene show Rs_imt", "Rs_imt", "did you mean Rs_int"),
     CommandCase(
         "misspelt activity",
         "factory import --activity=bringin_water",
@@ -180,7 +180,7 @@ COMMANDS = (
         "unknown factory scene",
         "factory build --scene=Rs_imt --out=FILES/new",
         "Rs_imt",
-        "did you mean Rs_int?",
+        "did you mean Rs_int",
     ),
     CommandCase(
         "unknown layout method",
