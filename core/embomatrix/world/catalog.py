@@ -267,10 +267,9 @@ def _look_up(table: Mapping[str, Json], name: str, kind: str) -> Json:
         return table[name]
     except KeyError:
         words = set(name.split("_"))
-        ending = [
-            known for known in table if words & set(known.partition(".")[0].split("_"))
-        ]  # bread: pack_of_bread
-        close = difflib.get_close_matches(name, ending, n=3, cutoff=0.0) or difflib.get_close_matches(
+        # For *bread* a slice of bread, rather than a bra.
+        sharing = [known for known in table if words & set(known.partition(".")[0].split("_"))]
+        close = difflib.get_close_matches(name, sharing, n=3, cutoff=0.0) or difflib.get_close_matches(
             name, table, n=3, cutoff=0.5
         )
         hint = f"did you mean {', '.join(close)}?" if close else f"for example {', '.join(sorted(table)[:3])}"

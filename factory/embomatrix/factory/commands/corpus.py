@@ -6,11 +6,10 @@ from typing import Annotated
 import typer
 
 from embomatrix.factory.commands.build import make_dataset
-from embomatrix.factory.commands.difficulty import script_results
+from embomatrix.factory.commands.difficulty import measured_records
 from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, in_physics
 from embomatrix.factory.commands.terminal import say, user_errors
 from embomatrix.factory.days.maker import DAYS
-from embomatrix.factory.evaluate.difficulty import with_scripts
 from embomatrix.factory.pipeline.corpus import (
     HELDOUT_SCENES,
     STARTER,
@@ -79,6 +78,5 @@ def corpus(
                 f"{len(joined.records)} tasks in {out / TASKS}; {joined.dropped} left out as too like a held-out one"
             )
             dataset = Dataset.load(out / TASKS)
-            results = script_results(dataset, dataset.records, dataset, jobs)
-            frozen = freeze(out, with_scripts(dataset.records, results), verified)
+            frozen = freeze(out, measured_records(dataset, jobs), verified)
     say(f"Internal-Verified 2: {frozen.tasks} tasks in {len(frozen.scenes)} scenes, {frozen.digest}")

@@ -6,11 +6,10 @@ from typing import Annotated
 import typer
 
 from embomatrix.factory.commands.build import make_dataset
-from embomatrix.factory.commands.difficulty import script_results
+from embomatrix.factory.commands.difficulty import measured_records
 from embomatrix.factory.commands.options import Jobs
 from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.days.maker import DAYS
-from embomatrix.factory.evaluate.difficulty import with_scripts
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.starter.archive import RECIPE, content_digest, pack, unpack
 from embomatrix.world.dataset import Dataset, write_dataset
@@ -55,6 +54,5 @@ def _built(out: Path, jobs: int | None) -> Dataset:
     settings = BuildSettings(RECIPE.train, RECIPE.heldout, RECIPE.seed, RECIPE.scenes, WriterKind.SOCIAL)
     make_dataset(out, settings, jobs=jobs, making=DAYS)
     dataset = Dataset.load(out)
-    results = script_results(dataset, dataset.records, dataset, jobs)
-    write_dataset(out, with_scripts(dataset.records, results), {})
+    write_dataset(out, measured_records(dataset, jobs), {})
     return Dataset.load(out)

@@ -84,16 +84,8 @@ def with_tools(wish: Wish) -> Wish:
     for predicates, ability, label, tool in TOOLS:
         about = next((each.things for each in wish.conditions if each.predicate in predicates), None)
         if about is not None and ability not in abilities and label not in wish.groups:
-            added.append(WishedObjects(label=label, kind=tool, room=_room_of(wish, about)))
+            added.append(WishedObjects(label=label, kind=tool, room=wish.room_of(about)))
     return wish.model_copy(update={"objects": (*wish.objects, *added)}) if added else wish
-
-
-def _room_of(wish: Wish, label: str) -> str:
-    """Return the room of a group, which may be that of its host."""
-    group = wish.groups[label]
-    while not group.room and group.host:
-        group = wish.groups[group.host]
-    return group.room
 
 
 def _of_different_things(requests: Sequence[WrittenRequest]) -> list[WrittenRequest]:

@@ -190,18 +190,13 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
         kinds = ["do"]  # *any book must be on the table* could mean every book
     kind = voice.choose(kinds)
     fields = _fields(clause, speaker)
-    if kind == "do":
+    passives = [p for v in _verbs(clause, book) if (p := _passive(v)) is not None] if kind == "done" else []
+    if kind == "do" or (kind == "done" and not passives):
         verb = _verb(clause, book, voice)
         return _written(
             voice.choose(book.forms("do")), {**fields, **_active(verb, _parted(clause, verb, fields))}
         )
     if kind == "done":
-        passives = [p for v in _verbs(clause, book) if (p := _passive(v)) is not None]
-        if not passives:
-            verb = _verb(clause, book, voice)
-            return _written(
-                voice.choose(book.forms("do")), {**fields, **_active(verb, _parted(clause, verb, fields))}
-            )
         forms = book.forms("done")
         if _LEAVES_CHOICE.match(clause.thing.words):
             forms = tuple(form for form in forms if "waiting" not in form) or forms

@@ -6,7 +6,6 @@ Object names of the scene never appear in it, so that no model can copy one into
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Self
 
 from embomatrix.factory.language.nouns import everyday_noun
@@ -42,15 +41,6 @@ class SceneKinds:
     kinds: tuple[KindInRoom, ...]
     sights: Mapping[str, str]
     """Appearance of rooms in words, if a vision model described them."""
-
-    @cached_property
-    def furniture(self) -> Mapping[tuple[str, str], int]:
-        """Number of pieces of furniture by kind and room."""
-        counts: Counter[tuple[str, str]] = Counter()
-        for each in self.kinds:
-            if not each.host:
-                counts[each.kind, each.room] += each.count
-        return counts
 
     def alike(self, kind: str, room: str = "") -> tuple[KindInRoom, ...]:
         """Return the entries of a kind in a room, or in all rooms."""

@@ -167,6 +167,13 @@ class Wish(StrictModel):
         """Groups by label."""
         return {group.label: group for group in self.objects}
 
+    def room_of(self, label: str) -> str:
+        """Return the room of a group, which is that of the furniture that it starts on or in."""
+        group = self.groups[label]
+        while group.host:
+            group = self.groups[group.host]
+        return group.room
+
     @property
     def wanted(self) -> tuple[str, ...]:
         """Labels of the groups that the conditions are about."""

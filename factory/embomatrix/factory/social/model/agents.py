@@ -65,15 +65,6 @@ ATTEMPTS: Final = 2
 LISTED_EARLIER: Final = 24
 """Number of earlier instructions that the day planner sees."""
 
-
-@functools.cache
-def _small_things() -> str:
-    """Return the names of small things that authored needs are about."""
-    roles = (role for event in events() for need in event.needs for role in need.roles)
-    kinds = {kind for role in roles if role.host for kind in role.kinds}
-    return ", ".join(sorted(everyday_noun(kind) for kind in kinds))
-
-
 T = TypeVar("T", bound=BaseModel)
 
 
@@ -252,6 +243,14 @@ class SocialModelAgents:
     def _request(self, purpose: str, system: str, user: str, seed: int, temperature: float) -> ChatRequest:
         messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))
         return ChatRequest(purpose, messages, self._max_tokens, temperature, seed)
+
+
+@functools.cache
+def _small_things() -> str:
+    """Return the names of small things that authored needs are about."""
+    roles = (role for event in events() for need in event.needs for role in need.roles)
+    kinds = {kind for role in roles if role.host for kind in role.kinds}
+    return ", ".join(sorted(everyday_noun(kind) for kind in kinds))
 
 
 def _unended(sentence: str) -> str:

@@ -14,6 +14,8 @@ PlainText = Annotated[str, Field(min_length=2, max_length=300, pattern=r"^[^\n<>
 """Text without markup, which could end a section of a later prompt."""
 MAX_REQUESTS = 4
 """Maximum number of requests in one dialogue."""
+MAX_NEEDS = 3
+"""Maximum number of needs of the person to whom an event happens."""
 
 
 class RoomSighting(StrictModel):
@@ -53,7 +55,7 @@ class EventAnswer(StrictModel):
     person: str
     room: str
     activity: PlainText
-    needs: tuple[PlainText, ...] = Field(min_length=1, max_length=3)
+    needs: tuple[PlainText, ...] = Field(min_length=1, max_length=MAX_NEEDS)
     other: str = ""
     other_need: str = Field("", max_length=300, pattern=r"^[^\n<>{}]*$")
 

@@ -109,9 +109,7 @@ def _is_at(group: WishedObjects, where: str, wish: Wish, scene: SceneKinds) -> b
     host = wish.groups.get(group.host)
     if host is not None and _is_named(where, host):
         return True
-    while group.host:
-        group = wish.groups[group.host]
-    return scene.room_called(where) == group.room
+    return scene.room_called(where) == wish.room_of(group.label)
 
 
 def _parts(conditions: tuple[Condition, ...] | list[Condition], wish: Wish) -> frozenset[str]:

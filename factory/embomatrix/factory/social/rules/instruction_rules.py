@@ -183,7 +183,7 @@ class InstructionRules:
         return found is not None and NUMBERS.get(found[1]) == condition.count
 
     def _wrong_rooms(self) -> Iterator[Fault]:
-        told = {self._room_of(group) for group in self._wish.objects} | self._own_rooms
+        told = {self._wish.room_of(group.label) for group in self._wish.objects} | self._own_rooms
         types = {self._scene.rooms.get(room, room) for room in told}
         text = " ".join(self._reading.tokens)
         for kind in sorted(ROOM_TYPES):
@@ -195,11 +195,6 @@ class InstructionRules:
                     FaultKind.WRONG_ROOM,
                     f"the instruction names the {words}, and no object of the wish is there",
                 )
-
-    def _room_of(self, group: WishedObjects) -> str:
-        while group.host:
-            group = self._groups[group.host]
-        return group.room
 
     def _ambiguous(self) -> Iterator[Fault]:
         for label in self._wish.wanted:
@@ -224,11 +219,13 @@ class InstructionRules:
         for each in self._wish.objects:
             if each.label != group.label and each.furniture is group.furniture:
                 host = self._groups[each.host].kind if each.host else ""
-                yield KindInRoom(self._room_of(each), each.kind, each.count, host)
+                yield KindInRoom(self._wish.room_of(each.label), each.kind, each.count, host)
         host = self._groups[group.host].kind if group.host else ""
         for there in self._scene.kinds:
             mine = (
-                there.kind == group.kind and there.room == self._room_of(group) and host in ("", there.host)
+                there.kind == group.kind
+                and there.room == self._wish.room_of(group.label)
+                and host in ("", there.host)
             )
             # The words mean the objects that are there already, as many as the wish declares.
             if bool(there.host) is not group.furniture and there.count > group.count * mine:
@@ -236,7 +233,7 @@ class InstructionRules:
 
     def _is_told_apart(self, group: WishedObjects, other: KindInRoom) -> bool:
         """True if the instruction names a room, a place or a state that the group has and the other object has not."""
-        room = self._room_of(group)
+        room = self._wish.room_of(group.label)
         kinds = self._scene.rooms
         if room != other.room:
             alike = kinds.get(room) == kinds.get(other.room)

@@ -63,19 +63,13 @@ def _too_many(wish: Wish, scene: SceneKinds) -> Iterator[Fault]:
     if movable > MAX_MOVABLE:
         yield Fault(FaultKind.TOO_MANY, f"the wish has {movable} objects: use at most {MAX_MOVABLE}")
     for group in wish.objects:
-        room = _room_of(group, wish)
+        room = wish.room_of(group.label)
         there = sum(each.count for each in scene.alike(group.kind, room))
         if group.furniture and group.count > max(1, there):
             yield Fault(
                 FaultKind.TOO_MANY,
                 f"{group.label}: {room} has {there} of {group.kind}, the wish takes {group.count}",
             )
-
-
-def _room_of(group: WishedObjects, wish: Wish) -> str:
-    while group.host:
-        group = wish.groups[group.host]
-    return group.room
 
 
 def _start_faults(group: WishedObjects, wish: Wish) -> Iterator[Fault]:
