@@ -94,6 +94,7 @@ OWN: Final[Mapping[str, str]] = {
     "cli.demo:_ensure_tasks": PACKAGED,
     "factory.commands.evaluate:_shipped": PACKAGED,
     "factory.commands.corpus:corpus": PACKAGED,
+    "factory.commands.starter:_comparable": PACKAGED,
     "factory.commands.starter:starter": PACKAGED,
     "world.catalog:_read": PACKAGED,
     "starter.archive:_unpacked": PACKAGED,

@@ -22,7 +22,7 @@ from embomatrix.factory.pipeline.corpus import (
     part_folder,
 )
 from embomatrix.factory.scenes.build import base_scene_of
-from embomatrix.starter.archive import unpack
+from embomatrix.starter.archive import RECIPE, unpack
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import Dataset, DatasetError, write_dataset
 from embomatrix.world.difficulty import Difficulty
@@ -142,6 +142,14 @@ def test_builds_add_to_the_shipped_dataset_in_scenes_of_their_own(tmp_path):
     assert {f"{home}_garden" for home in homes} <= {*heldout.scenes}  # a garden shows much of its home
     with pytest.raises(DatasetError, match=r"found --train 10 --heldout 200, expected more"):
         CorpusSettings(train=10).builds(starter)
+
+
+def test_a_shipped_dataset_of_another_size_is_not_built_again_for_a_comparison(tmp_path, monkeypatch):
+    monkeypatch.setattr("embomatrix.factory.commands.starter.RECIPE", dataclasses.replace(RECIPE, train=1))
+    done = CliRunner().invoke(app, ["starter", "--check", "--out", str(tmp_path)])
+    assert done.exit_code == 2
+    assert "the recipe makes 1 and 120" in " ".join(done.output.split())
+    assert not (tmp_path / "build.jsonl").exists()
 
 
 def test_corpus_check_prints_the_frozen_digest(corpus):

@@ -37,16 +37,29 @@ def starter(
             dataset = Dataset.load(out)
             say(f"{len(dataset.train)} training and {len(dataset.heldout)} held-out tasks in {out}: {digest}")
             return
+        shipped = _comparable(out / "shipped") if check else ""
         found = _built(out, jobs)
         digest = content_digest(found) if packed is None else pack(found, packed)
         say(f"{len(found.records)} tasks in {out}: {digest}")
         if check:
-            shipped = unpack(out / "shipped")
             if digest != shipped:
                 fail(
                     f"the recipe gives {digest}, and the shipped dataset is {shipped}: this version builds other tasks"
                 )
             say("the shipped dataset is what its recipe gives")
+
+
+def _comparable(folder: Path) -> str:
+    """Unpack the shipped dataset and return its digest. Exit at once if its size already differs from the recipe's."""
+    digest = unpack(folder)
+    shipped = Dataset.load(folder)
+    found = (len(shipped.train), len(shipped.heldout))
+    if found != (RECIPE.train, RECIPE.heldout):
+        fail(
+            f"the shipped dataset has {found[0]} training and {found[1]} held-out tasks, and the recipe makes "
+            f"{RECIPE.train} and {RECIPE.heldout}: it was not built by this recipe; --packed builds one that is"
+        )
+    return digest
 
 
 def _built(out: Path, jobs: int | None) -> Dataset:
