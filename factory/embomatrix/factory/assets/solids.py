@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,7 +27,7 @@ BACKGROUND: Final = "background"
 _SIDES: Final = 32
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Convex:
     """Convex part in the world: vertices (n, 3), unit axes to test (k, 3), and a radius around the vertices (spheres)."""
 
@@ -35,13 +35,17 @@ class Convex:
     axes: FloatArray
     radius_m: float = 0.0
 
-    @property
+    @functools.cached_property
     def low(self) -> FloatArray:
         return np.asarray(self.vertices.min(axis=0) - self.radius_m)
 
-    @property
+    @functools.cached_property
     def high(self) -> FloatArray:
         return np.asarray(self.vertices.max(axis=0) + self.radius_m)
+
+    @functools.cached_property
+    def center(self) -> FloatArray:
+        return np.asarray(self.vertices.mean(axis=0))
 
 
 def convex_of(part: ConvexPart, pose_world_asset: Pose) -> Convex:
@@ -75,7 +79,7 @@ def _template(
 
 def depth_m(a: Convex, b: Convex) -> float:
     """Return the overlap of two convex parts along the best tested axis; negative if an axis separates them."""
-    ca, cb = a.vertices.mean(axis=0), b.vertices.mean(axis=0)
+    ca, cb = a.center, b.center
     between = cb - ca
     lines = (
         between,
@@ -120,18 +124,26 @@ class Solids:
     ) -> dict[str, float]:
         """Return the owners that the parts overlap by more than the tolerance, with the greatest depth in metres."""
         found: dict[str, float] = {}
+        for owner, depth in self._depths(parts, ignore, tolerance_m):
+            if depth > max(tolerance_m, found.get(owner, 0.0)):
+                found[owner] = depth
+        return found
+
+    def is_clear(self, parts: Iterable[Convex]) -> bool:
+        """True if the parts overlap nothing by more than the tolerance."""
+        return all(depth <= TOLERANCE_M for _, depth in self._depths(parts, "", TOLERANCE_M))
+
+    def _depths(
+        self, parts: Iterable[Convex], ignore: str, tolerance_m: float
+    ) -> Iterator[tuple[str, float]]:
+        """Yield owner and depth of each pair of parts whose boxes overlap by more than the tolerance."""
         for part in parts:
             apart = (self._boxes[:, :3] >= part.high - tolerance_m) | (
                 self._boxes[:, 3:] <= part.low + tolerance_m
             )
             for index in np.flatnonzero(~apart.any(axis=1)):
-                owner = self._owners[index]
-                if owner == ignore:
-                    continue
-                depth = depth_m(part, self._parts[index])
-                if depth > max(tolerance_m, found.get(owner, 0.0)):
-                    found[owner] = depth
-        return found
+                if self._owners[index] != ignore:
+                    yield self._owners[index], depth_m(part, self._parts[index])
 
 
 def placed_parts(asset: Asset, pose: Pose, fractions: Sequence[float] = ()) -> list[Convex]:

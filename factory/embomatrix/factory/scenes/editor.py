@@ -122,7 +122,7 @@ class SceneEditor:
 
     def is_free(self, asset: Asset, pose: Pose) -> bool:
         """True if an asset overlaps nothing at a pose."""
-        return not self._solids.overlaps(placed_parts(asset, pose))
+        return self._solids.is_clear(placed_parts(asset, pose))
 
     def objection(self, asset: Asset, pose: Pose, target: str = "") -> LayoutReason | None:
         """Return the rule that an asset violates at a pose: collision, reach, or a blocked path. None if it is valid.
