@@ -18,11 +18,11 @@ from embomatrix.factory.commands.options import Seed
 from embomatrix.factory.commands.terminal import check_output, counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics_fit import evaluate_aesthetics
-from embomatrix.factory.evaluate.density import density_figures, homes
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
 from embomatrix.factory.evaluate.lies import evaluate_lies
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.readings import evaluate_readings, read_answers, shipped_answers
+from embomatrix.factory.evaluate.rooms import evaluate_rooms
 from embomatrix.factory.evaluate.scenes import (
     LayoutMethod,
     PoseSource,
@@ -40,6 +40,7 @@ from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.starter.archive import unpack
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
 
@@ -52,7 +53,7 @@ def evaluate(
     parts: Annotated[
         list[str],
         typer.Argument(
-            help="Parts: tasks, scripts, skills, readings, scenes, looks, admission, lies, aesthetics; or a .json file."
+            help="Parts: tasks, scripts, skills, readings, rooms, scenes, looks, admission, lies, aesthetics; or a .json file."
         ),
     ],
     dataset: Annotated[
@@ -72,7 +73,11 @@ def evaluate(
         typer.Option(help="JSON lines file with the paper's sample of tasks, for scenes and looks."),
     ] = None,
     only: Annotated[
-        int, typer.Option(min=1, help="Use only every n-th of the 140 tasks, or of a dataset's for skills.")
+        int,
+        typer.Option(
+            min=1,
+            help="Use only every n-th of the 140 tasks, of a dataset's for skills, or of the base scenes for rooms.",
+        ),
     ] = 1,
     outcomes: Annotated[
         Path | None,
@@ -108,7 +113,7 @@ def evaluate(
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
     ] = None,
 ) -> None:
-    """Measure parts of the factory: tasks, scripts, skills, answers of readers, layouts, admission, lies, aesthetics.
+    """Measure parts of the factory: tasks, scripts, skills, answers of readers, rooms, layouts, admission, lies, aesthetics.
 
     A language model judges looks, and also tasks if one is given.
     """
@@ -121,6 +126,7 @@ def evaluate(
         "scripts": lambda: evaluate_scripts(
             dataset or _shipped(scratch), training, jobs=jobs, counter=counter
         ),
+        "rooms": lambda: _rooms(only, seed),
         "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes, writer),
         "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed, writer)),
         "admission": lambda: evaluate_admissions(_given(dataset, "--dataset FOLDER")),
@@ -223,15 +229,21 @@ def _scenes(
     outcomes: Path | None,
     poses: PoseSource,
 ) -> EvaluationFigures:
-    """Measure generation rate, verification pass rate and time by three methods, and the density of base scenes."""
+    """Measure generation rate, verification pass rate and time by three methods."""
     kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
     with user_errors(outcomes, kept):
         log = outcome_log(outcomes, seed)
         with counter("trials", len(tasks) * len(METHODS)) as count:
             evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log, poses)
     taken = {"taken": f"one in {only} of the fixed tasks"} if only > 1 else {}
-    figures = (*evaluation.figures, *density_figures(homes()[::only], seed))
-    return replace(evaluation, figures=figures, conditions={**taken, **evaluation.conditions})
+    return replace(evaluation, conditions={**taken, **evaluation.conditions})
+
+
+def _rooms(only: int, seed: int) -> EvaluationFigures:
+    """Measure the furnishing and density of base scenes."""
+    chosen = Catalog.load().scene_ids[::only]
+    with counter("scenes", len(chosen)) as count:
+        return evaluate_rooms(chosen, seed, count)
 
 
 async def _looks(

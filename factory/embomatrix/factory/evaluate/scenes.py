@@ -8,7 +8,6 @@ share of tasks that the oracle solves is a separate figure, because it also depe
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import json
 import time
@@ -25,12 +24,6 @@ import numpy as np
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal, admit
 from embomatrix.factory.evaluate.aesthetics import Calibration, score_room
-from embomatrix.factory.evaluate.furnishing import (
-    NOTHING_COUNTED,
-    FurnishingCounts,
-    furnishing_counts,
-    furnishing_figures,
-)
 from embomatrix.factory.evaluate.manipulation import out_of_hand
 from embomatrix.factory.evaluate.room_plans import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
@@ -220,9 +213,8 @@ def _beauty(imported: ImportedTask, added: Sequence[str]) -> float | None:
 def evaluation_of(
     outcomes: Sequence[LayoutOutcome],
     conditions: Mapping[str, Any],
-    furnishing: FurnishingCounts = NOTHING_COUNTED,
 ) -> EvaluationFigures:
-    """Return the figures of all measured methods and of the base scenes, and the commonest reasons for rejection.
+    """Return the figures of all measured methods, and the commonest reasons for rejection.
 
     Only the tree method has goals.
     """
@@ -239,7 +231,7 @@ def evaluation_of(
             if shared:
                 low, high = interval_of_mean(shared)
                 notes.append(f"95 % interval of aesthetics_shared, {method}: [{low:.2f}, {high:.2f}].")
-    return EvaluationFigures("scenes", conditions, (*figures, *furnishing_figures(furnishing)), tuple(notes))
+    return EvaluationFigures("scenes", conditions, tuple(figures), tuple(notes))
 
 
 def _shared_scores(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> list[float]:
@@ -340,9 +332,7 @@ def evaluate_scenes(
         "methods": ", ".join(methods),
         "time": "CPU seconds of one task from BDDL text to scene, base scene built before, execution after",
     }
-    counts = [furnishing_counts(build_base_scene(name)) for name in sorted({task.scene for task in tasks})]
-    total = functools.reduce(FurnishingCounts.plus, counts, NOTHING_COUNTED)
-    return evaluation_of(outcomes, conditions, total), outcomes
+    return evaluation_of(outcomes, conditions), outcomes
 
 
 def _judged(
