@@ -143,8 +143,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         openings = banned_openings(below(sources, (*ROOTS, "tests")))
         sys.stdout.writelines(f"{line}\n" for line in openings)
         return int(bool(openings))
-    from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine
+    from embomatrix.bench.report.figures import BenchResult, describe_machine
     from embomatrix.bench.report.output import hand_in
+    from embomatrix.host.code_version import commit_here
 
     machine = describe_machine()
     unit_test_s = None if options.no_tests else time_unit_tests(options.root)

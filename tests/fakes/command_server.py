@@ -23,7 +23,7 @@ IMPORTED = (
     "pybullet",
     "embomatrix.factory.commands.app",
     "embomatrix.factory.commands.scenes",
-    "embomatrix.factory.commands.play",
+    "embomatrix.cli.play",
     "embomatrix.trainer.run.loop",
     "embomatrix.trainer.commands.train",
     "embomatrix.manager.commands.app",

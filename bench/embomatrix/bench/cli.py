@@ -22,13 +22,13 @@ from embomatrix.bench.fidelity.suite import DISAGREEMENTS_FILE, RESULTS_FILE, Fi
 from embomatrix.bench.peers.contest import PeerSizes, bench_peers
 from embomatrix.bench.report.figures import (
     BenchResult,
-    commit_here,
     describe_machine,
     merge_parts,
     read_result,
 )
 from embomatrix.bench.report.output import console, errors, hand_in, refusals, write
 from embomatrix.bench.report.page import check_page, render_page
+from embomatrix.host.code_version import commit_here
 from embomatrix.host.commands import command_group
 from embomatrix.pages.figures import Figure
 from embomatrix.sim.physical.actor import physical_simulator

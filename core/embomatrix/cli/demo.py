@@ -20,6 +20,8 @@ DEFAULT_OUT: Final = Path("runs/demo")
 IMITATION_STEPS: Final = 340
 GRPO_STEPS: Final = 420
 """Budgets in steps: the same seed gives the same curve on a fast machine and on a slow one."""
+EVALUATE_EVERY: Final = 70
+"""Steps of GRPO between evaluations: five beside those before and after, each in a few seconds."""
 console = Console()
 
 
@@ -57,6 +59,7 @@ def demo(
             f"--steps={steps}",
             f"--imitate-steps={imitate_steps}",
             f"--seed={seed}",
+            f"--evaluate-every={EVALUATE_EVERY}",
         ]
         if threads:
             options.append(f"--threads={threads}")
@@ -68,6 +71,12 @@ def demo(
         f"tasks {built_s - started_s:.0f} s, training {ended_s - built_s:.0f} s, logs in {folder / 'cluster' / 'logs'}",
         highlight=False,
     )
+    heldout = Dataset.load(dataset).heldout
+    if heldout:
+        # Rich would wrap a line that is meant to be copied.
+        typer.echo(
+            f"try next: embomatrix play {heldout[0].task.task_id} --policy {folder} --dataset {dataset}"
+        )
 
 
 def _ensure_tasks(dataset: Path) -> None:

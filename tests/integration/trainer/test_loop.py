@@ -1,6 +1,7 @@
 """Training run: it learns, resumes exactly, and reports its time by activity."""
 
 import json
+import shutil
 import signal
 from contextlib import ExitStack
 from dataclasses import replace
@@ -17,6 +18,7 @@ from embomatrix.trainer.grpo.update import Updater
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.lifecycle.stopwatch import Activity
 from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
+from embomatrix.trainer.logging.evaluations import AFTER, BEFORE, DURING, EVALUATIONS, read_evaluations
 from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.logging.report import success_rows, time_rows
@@ -85,6 +87,37 @@ def test_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_path):
     assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "halves"))
 
 
+def test_evaluations_during_training_change_nothing_and_a_resumed_run_repeats_none(tmp_path):
+    _, plain = run(tmp_path / "plain")
+    summary, whole = run(tmp_path / "whole", evaluation__every=2, evaluation__samples_during=1)
+    assert torch.equal(weights(plain), weights(whole))
+    found = read_evaluations(tmp_path / "whole")
+    assert [(each.step, each.label, len(each.answers)) for each in found] == [
+        (0, BEFORE, 8),
+        (2, DURING, 4),
+        (4, DURING, 4),
+        (6, AFTER, 8),
+    ]
+    page = summary.report.read_text()
+    assert "Held-out success during GRPO" in page
+    assert "Why held-out plans failed" in page
+    run(tmp_path / "halves", evaluation__every=2, evaluation__samples_during=1)
+    newest = CheckpointStore(tmp_path / "halves" / CHECKPOINTS, keep=9).latest()
+    shutil.rmtree(newest)  # as if the run had been killed after its third step
+    run(tmp_path / "halves", resume=True)
+    assert read_evaluations(tmp_path / "halves") == found
+
+
+def test_cut_lines_of_an_evaluation_are_left_out(tmp_path):
+    run(tmp_path)
+    path = tmp_path / EVALUATIONS
+    whole = read_evaluations(tmp_path)
+    path.write_bytes(path.read_bytes()[:-40])
+    cut = read_evaluations(tmp_path)
+    assert cut[0] == whole[0]
+    assert cut[1].answers == whole[1].answers[:-1]
+
+
 def test_slow_cluster_does_not_change_the_learned_weights(tmp_path):
     _, fast = run(tmp_path / "fast")
     _, slow = run(tmp_path / "slow", SymbolicCluster(TASKS, delay_s=0.02))
@@ -94,8 +127,14 @@ def test_slow_cluster_does_not_change_the_learned_weights(tmp_path):
 def test_run_writes_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
     summary, _ = run(tmp_path, keep_checkpoints=1)
     page = summary.report.read_text()
-    assert page.count("<svg") == 5
-    assert "Where the time went" in page
+    assert page.count("<svg") == 6, "a curve for each figure of a step"
+    for part in (
+        "Success on held-out tasks",
+        "Where the time went",
+        "seed 0",
+        "10 training and 4 held-out tasks",
+    ):
+        assert part in page
     assert [row["step"] for row in read_metrics(tmp_path)] == [1, 2, 3, 4, 5, 6]
     sample = json.loads((tmp_path / "samples.jsonl").read_text().splitlines()[0])
     assert {"step", "task", "instruction", "text", "reward", "advantage"} <= set(sample)
@@ -104,7 +143,7 @@ def test_run_writes_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
     assert sum(seconds for _, seconds, _ in time_rows(summary.outcome)) == pytest.approx(
         summary.outcome.wall_s
     )
-    assert success_rows(summary)[0][0] == "all tasks"
+    assert success_rows(summary)[0][:2] == ("all", "4")
     outcome = read_outcome(tmp_path)
     assert (outcome.steps, outcome.rollouts, len(outcome.before), len(outcome.after)) == (6, 96, 4, 4)
     assert 0 <= outcome.shares.waiting <= outcome.shares.overhead < 1

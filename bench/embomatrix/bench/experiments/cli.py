@@ -29,9 +29,10 @@ from embomatrix.bench.experiments.design import (
 )
 from embomatrix.bench.experiments.findings import figures_of, findings_of, read_runs
 from embomatrix.bench.experiments.section import add_section, learning_section
-from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine
+from embomatrix.bench.report.figures import BenchResult, describe_machine
 from embomatrix.bench.report.output import hand_in, write
 from embomatrix.cli.local_cluster import no_problem, run_command
+from embomatrix.host.code_version import commit_here
 from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores

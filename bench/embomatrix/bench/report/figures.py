@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,6 @@ from embomatrix.worker.host.resources import measure_score, versions
 
 BUSY_SHARE: Final = 0.25
 """Load of a core above which a machine counts as shared before a benchmark begins."""
-GIT_S: Final = 10.0
 
 
 class BenchError(Exception):
@@ -112,23 +110,6 @@ def describe_machine() -> dict[str, Any]:
 def is_shared(machine: Mapping[str, Any]) -> bool:
     """Return whether the machine was busy before the benchmark began."""
     return bool(machine["load_before"] > BUSY_SHARE * machine["cores"])
-
-
-def commit_here() -> str:
-    """Commit of the checkout that this code runs from, ``-dirty`` if changed; else the package's version."""
-    here = Path(__file__).resolve()
-    try:
-        # An install inside another repository's folder must not name that repository's commit.
-        _git(here.parent, "ls-files", "--error-unmatch", here.name)
-        return _git(here.parent, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
-    except (OSError, subprocess.SubprocessError):
-        return f"version {versions()['embomatrix']}"
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    command = ("git", "-C", str(folder), *arguments)
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=GIT_S, check=True)
-    return answer.stdout.strip()
 
 
 def _cpu_model() -> str:

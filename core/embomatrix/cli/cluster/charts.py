@@ -1,41 +1,17 @@
-"""Charts of a run's report as SVG. The page sets their colours, for light and dark themes."""
+"""Charts of a run's report as SVG."""
 
-import io
-import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from embomatrix.pages.charts import BAD, GOOD, SECOND, STYLE, add_legend, new_chart, svg_of
 from embomatrix.rpc.wire.run_log import PhaseSummary, RolloutPhase, RunSeries
 
-SIZE_IN: Final = (6.2, 2.5)
 MOST_POINTS: Final = 300
-"""Most points of a line at this size."""
-INK, GRID, GOOD, BAD, SECOND = "#010101", "#020202", "#030303", "#040404", "#050505"
-VARIABLES: Final[Mapping[str, str]] = {
-    INK: "var(--soft)",
-    GRID: "var(--line)",
-    GOOD: "var(--good)",
-    BAD: "var(--bad)",
-    SECOND: "var(--second)",
-}
-"""CSS variable that replaces each drawing colour."""
-STYLE: Final[dict[Any, Any]] = {
-    "svg.fonttype": "none",
-    "font.size": 10.0,
-    "axes.edgecolor": GRID,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "text.color": INK,
-    "grid.color": GRID,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-}
+"""Most points of a line at the size of a chart."""
 
 
 def throughput_chart(series: RunSeries) -> str:
@@ -48,33 +24,33 @@ def throughput_chart(series: RunSeries) -> str:
 
     completed, failed = rates(series.completed), rates(series.failed)
     with mpl.rc_context(STYLE):
-        figure, axes = _chart("rollouts/s")
+        figure, axes = new_chart("rollouts/s")
         times_s = _times(axes, len(completed), step_s)
         axes.fill_between(times_s, completed, step="post", color=GOOD, alpha=0.18, linewidth=0)
         axes.step(times_s, completed, where="post", color=GOOD, linewidth=1.6, label="completed")
         if any(failed):
             axes.step(times_s, failed, where="post", color=BAD, linewidth=1.6, label="failed")
-            _legend(axes)
+            add_legend(axes)
         axes.set_ylim(bottom=0)
-        return _svg(figure, "throughput", "Completed rollouts per second over the run")
+        return svg_of(figure, "throughput", "Completed rollouts per second over the run")
 
 
 def busy_chart(shares: Sequence[float], step_s: float) -> str:
     """Draw the share of busy slots over the run."""
     with mpl.rc_context(STYLE):
-        figure, axes = _chart("slots at work")
+        figure, axes = new_chart("slots at work")
         times_s = _times(axes, len(shares), step_s)
         axes.fill_between(times_s, list(shares), step="post", color=SECOND, alpha=0.18, linewidth=0)
         axes.step(times_s, list(shares), where="post", color=SECOND, linewidth=1.6)
         axes.set_ylim(0, 1.02)
         axes.yaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{share:.0%}"))
-        return _svg(figure, "busy", "Share of slots at work over the run")
+        return svg_of(figure, "busy", "Share of slots at work over the run")
 
 
 def phase_chart(phases: Mapping[RolloutPhase, PhaseSummary]) -> str:
     """Draw median, 95th and 99th percentile of each phase on a logarithmic axis."""
     with mpl.rc_context(STYLE):
-        figure, axes = _chart("")
+        figure, axes = new_chart("")
         for row, phase in enumerate(reversed(RolloutPhase)):
             found = phases[phase]
             # A logarithmic axis has no zero: shorter times are drawn at 0.01 ms.
@@ -89,26 +65,12 @@ def phase_chart(phases: Mapping[RolloutPhase, PhaseSummary]) -> str:
         axes.grid(visible=False, axis="y")
         axes.grid(visible=True, axis="x", linewidth=0.8)
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _milliseconds(value)))
-        _legend(axes)
-        return _svg(figure, "phases", "Quantiles of the phases of a rollout")
+        add_legend(axes)
+        return svg_of(figure, "phases", "Quantiles of the phases of a rollout")
 
 
 def _milliseconds(value_ms: float) -> str:
     return f"{value_ms / 1e3:g} s" if value_ms >= 1e3 else f"{value_ms:g} ms"
-
-
-def _chart(label: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=SIZE_IN, layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_ylabel(label)
-    axes.grid(visible=True, axis="y", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(length=0)
-    return figure, axes
-
-
-def _legend(axes: Axes) -> None:
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.1)
 
 
 def _times(axes: Axes, steps: int, step_s: float) -> list[float]:
@@ -119,19 +81,3 @@ def _times(axes: Axes, steps: int, step_s: float) -> list[float]:
     axes.set_xlabel(f"{name} since the run was opened")
     axes.set_xlim(0, whole_s)
     return [step * step_s for step in range(steps)]
-
-
-def _svg(figure: Figure, name: str, description: str) -> str:
-    """Return the figure as an SVG element without header, size, or ids that two charts would share."""
-    buffer = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r' id="(?![pmC][0-9a-f]{10}")[^"]*"', "", text)
-    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
-    text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2)
-    for drawn, variable in VARIABLES.items():
-        text = text.replace(drawn, variable)
-    return text.replace("<svg ", f'<svg role="img" aria-label="{description}" ', 1).strip()

@@ -81,6 +81,10 @@ def train(
     imitate_steps: Annotated[
         int | None, typer.Option(min=0, help="Steps of imitation instead of seconds.")
     ] = None,
+    evaluate_every: Annotated[
+        int | None,
+        typer.Option(min=0, help="Steps of GRPO between evaluations on held-out tasks. Default: 0, none."),
+    ] = None,
     resume: _RESUME = False,
     seed: _SEED = None,
     settings_file: _SETTINGS = None,
@@ -110,6 +114,7 @@ def train(
             "grpo.steps": steps,
             "imitation.seconds": imitate_seconds,
             "imitation.steps": imitate_steps,
+            "evaluation.every": evaluate_every,
             "track": track,
             **_coefficients(reward or ()),
         }
@@ -271,7 +276,7 @@ def _show_summary(summary: TrainingSummary) -> None:
 
     console = Console(markup=False)
     title = "held-out success, 95 % intervals"
-    table = Table("tasks", "before GRPO", "after", "difference", title=title, title_justify="left")
+    table = Table("tasks", "", "before GRPO", "after GRPO", "difference", title=title, title_justify="left")
     for row in success_rows(summary):
         table.add_row(*row)
     if table.rows:

@@ -226,6 +226,11 @@ class EvaluationSettings(_Frozen):
     """Evaluation on held-out tasks."""
 
     samples: int = Field(default=10, ge=1)
+    """Plans per task before and after GRPO."""
+    every: int = Field(default=0, ge=0)
+    """Steps of GRPO between evaluations during it. 0: none."""
+    samples_during: int = Field(default=4, ge=1)
+    """Plans per task in the evaluations during GRPO."""
     temperature: float = Field(default=1.0, ge=0)
     chunk: int = Field(default=8, ge=1)
 

@@ -33,13 +33,14 @@ class TrainingTask:
 class TaskSet:
     """Training and held-out tasks. ``bundle_bytes`` returns a bundle by its digest.
 
-    ``kinds`` maps a category to all categories of the same kind, which have the same abilities.
+    ``kinds`` maps a category to all categories of the same kind, which have the same abilities. ``folder`` is the dataset's.
     """
 
     train: tuple[TrainingTask, ...]
     heldout: tuple[TrainingTask, ...]
     bundle_bytes: Callable[[str], bytes] = field(repr=False)
     kinds: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    folder: Path | None = None
 
 
 def load_tasks(folder: Path) -> TaskSet:
@@ -54,7 +55,7 @@ def load_tasks(folder: Path) -> TaskSet:
     if not train:
         raise TrainerError(f"the dataset at {folder} has no training tasks: build it again with more tasks")
     heldout = tuple(tasks[record.task.task_id] for record in dataset.heldout)
-    return TaskSet(train, heldout, dataset.bundle_bytes, kinds.table())
+    return TaskSet(train, heldout, dataset.bundle_bytes, kinds.table(), folder)
 
 
 def read_tasks(

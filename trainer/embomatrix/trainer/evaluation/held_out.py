@@ -13,9 +13,20 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from embomatrix.pages.figures import Interval
-from embomatrix.trainer.cluster.gateway import Gateway, PlanGroup, PlanOutcome, result_of
+from embomatrix.skills.parse import PlanError
+from embomatrix.skills.prompt import Codec
+from embomatrix.skills.syntax import Plan
+from embomatrix.trainer.cluster.gateway import (
+    Gateway,
+    PlanGroup,
+    PlanOutcome,
+    parse_policy_text,
+    result_of,
+)
 from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
-from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.trainer.evaluation.answers import Answer
+from embomatrix.trainer.evaluation.intervals import bootstrap, mean_over_tasks
+from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
 
@@ -38,15 +49,26 @@ class TaskScore:
         return self.successes / self.samples if self.samples else float("nan")
 
 
+@dataclass(frozen=True, slots=True)
+class HeldOutAnswer:
+    """Sampled text of a held-out task, its verdict, and its plan, empty if it holds none."""
+
+    text: str
+    verdict: AnswerVerdict
+    plan: Plan = ()
+
+
 @dataclass(frozen=True)
 class HeldOutEvaluation:
-    """Scores of all tasks, in task order."""
+    """Scores of all tasks, in task order, with the sampled plans. Checkpoints keep the scores only."""
 
     scores: tuple[TaskScore, ...]
+    answers: tuple[HeldOutAnswer, ...] = ()
 
     def success(self, category: str = "") -> Interval:
         """Mean success over the tasks of one category, or of all."""
-        return bootstrap([score.rate for score in self.scores if category in ("", score.category)])
+        rates = [score.rate for score in self.scores if category in ("", score.category)]
+        return mean_over_tasks(rates).interval
 
     @property
     def categories(self) -> tuple[str, ...]:
@@ -74,37 +96,50 @@ def evaluate_policy(
     gateway: Gateway,
     settings: EvaluationSettings,
     *,
+    samples: int,
     max_new: int,
     seed: int,
     label: str,
     report: Callable[[int, int], None],
 ) -> HeldOutEvaluation:
-    """Sample ``settings.samples`` plans per task and execute each once. ``report`` gets finished and total tasks."""
+    """Sample plans of each task and execute each once. ``report`` gets finished and total tasks."""
     device = next(iter(policy.parameters())).device
     generator = torch.Generator(device).manual_seed(seed)
     chunks = [tasks[at : at + settings.chunk] for at in range(0, len(tasks), settings.chunk)]
-    gateway.announce(dict(enumerate(chunks)), settings.samples)
-    pending: list[tuple[TrainingTask, Future[tuple[PlanOutcome, ...]]]] = []
+    gateway.announce(dict(enumerate(chunks)), samples)
+    pending: list[tuple[PlanGroup, Future[tuple[PlanOutcome, ...]]]] = []
     for number, chunk in enumerate(chunks):
         prompts = [prompt_builder.plain(task) for task in chunk]
         tokens = [prompt.tokens for prompt in prompts]
-        drawn = policy.sample(tokens, settings.samples, settings.temperature, max_new, generator)
+        drawn = policy.sample(tokens, samples, settings.temperature, max_new, generator)
         groups = [
             PlanGroup(
                 task,
                 prompt.situation,
-                drawn.texts[row * settings.samples : (row + 1) * settings.samples],
+                drawn.texts[row * samples : (row + 1) * samples],
                 evaluation_seed(seed, task.task.task_id),
             )
             for row, (task, prompt) in enumerate(zip(chunk, prompts, strict=True))
         ]
-        pending += zip(chunk, gateway.submit(f"{label}-{number}", number, groups, policy.codec), strict=True)
-    scores = []
-    for task, future in pending:
+        pending += zip(groups, gateway.submit(f"{label}-{number}", number, groups, policy.codec), strict=True)
+    scores: list[TaskScore] = []
+    answers: list[HeldOutAnswer] = []
+    for group, future in pending:
         outcomes: tuple[PlanOutcome, ...] = result_of(future)
-        scores.append(_task_score(task, outcomes))
+        scores.append(_task_score(group.task, outcomes))
+        answers += [_answer(group, policy.codec, sample, outcome) for sample, outcome in enumerate(outcomes)]
         report(len(scores), len(tasks))
-    return HeldOutEvaluation(tuple(scores))
+    return HeldOutEvaluation(tuple(scores), tuple(answers))
+
+
+def _answer(group: PlanGroup, codec: Codec, sample: int, outcome: PlanOutcome) -> HeldOutAnswer:
+    answer = Answer(group.task.task.task_id, sample, outcome.text)
+    try:
+        plan = parse_policy_text(outcome.text, group.situation, codec)
+    except PlanError as error:
+        return HeldOutAnswer(outcome.text, unparsable_verdict(answer, error))
+    verdict = executed_verdict(answer, group.task.task, plan, outcome.outcome)
+    return HeldOutAnswer(outcome.text, verdict, plan)
 
 
 def _task_score(task: TrainingTask, outcomes: Sequence[PlanOutcome]) -> TaskScore:

@@ -1,4 +1,4 @@
-"""Models to evaluate: a checkpoint of a run, a saved policy, or any Hugging Face model."""
+"""Models to evaluate: a run, one of its checkpoints, a saved policy, or any Hugging Face model."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from embomatrix.trainer.config.settings import (
     TrainSettings,
     read_settings,
 )
-from embomatrix.trainer.lifecycle.checkpoint import read_state
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.loading import configure_torch, saved_policy
 from embomatrix.trainer.policy.protocol import Policy
@@ -22,11 +22,13 @@ from embomatrix.trainer.policy.tiny import TinyPolicy
 def load_model(
     named: str, codec: Codec | None, *, threads: int | None, device: str
 ) -> tuple[Policy, TrainSettings]:
-    """Load a policy with its settings. Raises TrainerError.
+    """Load a policy with its settings. The folder of a run stands for its newest checkpoint. Raises TrainerError.
 
     A trained policy keeps its codec; any other model uses ``codec``, by default JSON.
     """
     folder = Path(named)
+    if (folder / CHECKPOINTS).is_dir():
+        folder = CheckpointStore(folder / CHECKPOINTS, keep=1).latest() or folder
     if folder.is_dir() and (folder / "policy").is_dir():
         _, settings = read_state(folder)
         # A checkpoint holds the merged model, so the base model of its adapters is not needed.
@@ -39,7 +41,7 @@ def load_model(
         return saved_policy(folder, settings), settings
     if folder.is_dir() and not HfPolicy.is_saved_in(folder):
         raise TrainerError(
-            f"{folder} is not a model: expected runs/NAME/checkpoints/step-000050, or a folder with config.json"
+            f"{folder} is not a model: expected a run such as runs/NAME, one of its checkpoints, or a folder with config.json"
         )
     written = codec or HfPolicy.codec_in(folder) or Codec.JSON
     settings = read_settings(None, {"device": device, "codec": written}, LANGUAGE_MODEL_DEFAULTS)

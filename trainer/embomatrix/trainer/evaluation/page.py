@@ -33,12 +33,13 @@ def evaluation_page(
     tasks = [_task_row(task) for task in report["verdicts"]]
     return string.Template(template).substitute(
         head=page_head(f"{title} · EmboMatrix evaluation"),
+        plan_style=plan_style(),
         title=html.escape(title),
         about=html.escape(about(report)),
         scores="".join(map(_section, score_tables(report, beside))),
         notes="".join(f"<section class='lines'>{html.escape(note)}</section>" for note in notes(report)),
         causes="".join(map(_section, cause_tables(report))),
-        pictures="".join(_picture(picture) for picture in pictures),
+        pictures="".join(picture_section(picture, picture.task.task_id) for picture in pictures),
         count=report["tasks"],
         tasks=html_table([("task", "category", "succeeded", "partial", "causes"), *tasks]),
         intervals=html.escape(INTERVALS),
@@ -63,16 +64,22 @@ def _task_row(task: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _picture(picture: Picture) -> str:
+def plan_style() -> str:
+    """Return the CSS of ``picture_section``."""
+    return files("embomatrix.trainer.evaluation").joinpath("plan.css").read_text(encoding="utf-8")
+
+
+def picture_section(picture: Picture, title: str) -> str:
+    """Return a section of half the page's width: verdict, instruction, plan view and the plan step by step."""
     verdict, task = picture.verdict, picture.task
-    title = "success" if verdict.success else (verdict.cause or "").replace("_", " ")
+    outcome = "success" if verdict.success else (verdict.cause or "").replace("_", " ")
     items = []
     for number, line in enumerate(picture.lines, start=1):
         why = f"<small>{html.escape(verdict.sentence)}</small>" if number == verdict.step else ""
         items.append(f'<li class="{css_class(verdict, number)}">{html.escape(line)}{why}</li>')
     kind = "ok" if verdict.success else "bad"
     return (
-        f'<section class="half plan"><h3>{html.escape(task.task_id)}</h3>'
-        f'<p><span class="verdict {kind}">{html.escape(title)}</span> {html.escape(task.instruction)}</p>'
+        f'<section class="half plan"><h3>{html.escape(title)}</h3>'
+        f'<p><span class="verdict {kind}">{html.escape(outcome)}</span> {html.escape(task.instruction)}</p>'
         f"{plan_view(picture.scene, task, picture.plan, verdict)}<ol>{''.join(items)}</ol></section>"
     )

@@ -19,6 +19,27 @@ if TYPE_CHECKING:
     from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
 
 _LINE_INTERVAL_S: Final = 10.0
+_GUESS_AFTER_S: Final = 5.0
+"""Seconds of a phase after which its remaining time is shown."""
+
+
+class RemainingTime:
+    """Estimate of the time that a phase will still take, from the time of its share so far."""
+
+    def __init__(self) -> None:
+        self._phase = ""
+        self._began_s = 0.0
+        self._began_at = 0.0
+
+    def guess_s(self, phase: str, share: float) -> float | None:
+        """Return seconds, None at the beginning of a phase. A resumed phase may begin at any share."""
+        now_s = time.monotonic()
+        if phase != self._phase:
+            self._phase, self._began_s, self._began_at = phase, now_s, share
+        spent_s, done = now_s - self._began_s, share - self._began_at
+        if spent_s < _GUESS_AFTER_S or done <= 0:
+            return None
+        return spent_s * max(0.0, 1.0 - share) / done
 
 
 class LineDisplay:
@@ -28,6 +49,7 @@ class LineDisplay:
         self._console = console
         self._printed_s = -_LINE_INTERVAL_S
         self._validation = ""
+        self._remaining = RemainingTime()
 
     def __enter__(self) -> Self:
         return self
@@ -63,11 +85,20 @@ class LineDisplay:
 
     def _show(self, title: str, share: float, figures: Mapping[str, str]) -> None:
         now_s = time.monotonic()
+        left = self._left(title, share)
         if now_s - self._printed_s >= _LINE_INTERVAL_S:
             self._printed_s = now_s
             self._print(
-                f"{title} {share:.0%}: {', '.join(f'{name} {value}' for name, value in figures.items())}"
+                f"{title} {share:.0%}{left}: {', '.join(f'{name} {value}' for name, value in figures.items())}"
             )
+
+    def _left(self, title: str, share: float) -> str:
+        """Return the remaining time of the phase in words, empty if it can't be guessed yet."""
+        guess_s = self._remaining.guess_s(title, share)
+        if guess_s is None:
+            return ""
+        minutes, seconds = divmod(round(guess_s), 60)
+        return f", {minutes} min {seconds:02} s left" if minutes else f", {seconds} s left"
 
     def _print(self, text: str) -> None:
         self._console.print(text, highlight=False, markup=False)
@@ -93,7 +124,8 @@ class LiveDisplay(LineDisplay):
         table.add_row(*figures.values())
         share = min(1.0, share)
         bar = ProgressBar(total=1.0, completed=share, width=60)
-        self._live.update(Group(Text(f"{title}  {share:.0%}", style="bold"), bar, table))
+        shown = f"{title}  {share:.0%}{self._left(title, share)}"
+        self._live.update(Group(Text(shown, style="bold"), bar, table))
 
 
 def display_on(console: Console) -> LineDisplay:

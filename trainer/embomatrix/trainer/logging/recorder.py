@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord
+from embomatrix.trainer.logging.evaluations import DURING, EVALUATIONS, lines_of
 from embomatrix.trainer.logging.trackers import GRPO_PHASE, IMITATION_PHASE, Tracker
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
@@ -55,10 +56,13 @@ class Recorder:
         self._append(IMITATION, row)
         self._track(IMITATION_PHASE, row)
 
-    def evaluation(self, label: str, result: HeldOutEvaluation) -> None:
-        """Forward held-out success to the trackers. Checkpoints and the report store it too."""
+    def evaluation(self, step: int, label: str, result: HeldOutEvaluation) -> None:
+        """Record an evaluation after a step of GRPO, and forward its success to the trackers."""
+        with (self._folder / EVALUATIONS).open("a", encoding="utf-8") as file:
+            file.write(lines_of(step, label, result.answers))
         rates = {category: result.success(category).value for category in result.categories}
-        self._track(f"success {label}", {"step": 0, "all": result.success().value, **rates})
+        at = step if label == DURING else 0
+        self._track(f"success {label}", {"step": at, "all": result.success().value, **rates})
 
     def forget_after(self, step: int, *names: str) -> None:
         """Drop later steps from the files: a resumed run takes them again."""

@@ -1,25 +1,48 @@
-"""HTML report of a run: learning curves, success before and after GRPO, and time by activity, in one file."""
+"""HTML report of a run: what changed on held-out tasks and why plans fail, curves, and where the time went, in one file."""
+
+from __future__ import annotations
 
 import html
+import platform
+import string
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
+import torch
+
+from embomatrix.host.code_version import commit_here
+from embomatrix.host.limits import usable_cores
+from embomatrix.pages.figures import Interval
 from embomatrix.pages.head import html_table, page_head
 from embomatrix.rpc.wire.values import RunStats
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, improvement
+from embomatrix.trainer.evaluation.intervals import mean_over_tasks
+from embomatrix.trainer.evaluation.page import picture_section, plan_style
+from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
+from embomatrix.trainer.logging.curves import step_curve, success_curve
+from embomatrix.trainer.logging.evaluations import AFTER, BEFORE, RecordedEvaluation
+from embomatrix.trainer.logging.examples import examples_of
 from embomatrix.trainer.logging.outcome import RunOutcome, TaskRate
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from embomatrix.trainer.data.tasks import TaskSet
+    from embomatrix.world.task import TaskCategory
 
 REPORT = "report.html"
-_WIDTH, _HEIGHT, _MARGIN = 640, 220, 44
-_CURVES = (
-    ("reward", "mean reward of a step", "#1b6ca8"),
-    ("success", "success rate of rollouts", "#2a7f3f"),
-    ("plan_steps", "executed steps per plan", "#8a5a00"),
-    ("entropy", "entropy of a token (nats)", "#7a3b8f"),
-    ("zero_variance_groups", "zero-variance groups", "#a83232"),
+_CURVES: Final = (
+    ("reward", "mean reward of a step", False),
+    ("success", "success of training rollouts", True),
+    ("plan_steps", "executed steps per plan", False),
+    ("entropy", "entropy of a token (nats)", False),
+    ("kl", "KL to the policy after imitation (nats)", False),
+    ("zero_variance_groups", "groups without a signal", True),
 )
+"""Figures of a step: name, label, and whether it is a share."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +57,15 @@ class TrainingSummary:
     report: Path
 
 
+@dataclass(frozen=True)
+class TrainedOn:
+    """Tasks that a run trained on, a digest of them, and the run's seed."""
+
+    tasks: TaskSet
+    digest: str
+    seed: int
+
+
 def time_rows(outcome: RunOutcome) -> list[tuple[str, float, float]]:
     """Rows of activity, seconds and share of the wall clock, including a row for the remaining time."""
     total = max(outcome.wall_s, 1e-9)
@@ -42,8 +74,8 @@ def time_rows(outcome: RunOutcome) -> list[tuple[str, float, float]]:
     return [*rows, ("other", rest, rest / total)]
 
 
-def success_rows(summary: TrainingSummary) -> list[tuple[str, str, str, str]]:
-    """Rows of category, success before, success after, and paired difference, each with its interval."""
+def success_rows(summary: TrainingSummary) -> list[tuple[str, str, str, str, str]]:
+    """Rows of category, number of tasks, success before, success after, and paired difference, each with its interval."""
     if summary.before is None or summary.after is None:
         return []
     rows = []
@@ -51,7 +83,8 @@ def success_rows(summary: TrainingSummary) -> list[tuple[str, str, str, str]]:
         change = improvement(_only(summary.before, category), _only(summary.after, category))
         rows.append(
             (
-                category or "all tasks",
+                (category or "all").replace("_", " "),
+                str(len(_only(summary.after, category).scores)),
                 summary.before.success(category).as_percent(),
                 summary.after.success(category).as_percent(),
                 change.as_percent(),
@@ -78,58 +111,171 @@ def prewarm_share(stats: RunStats) -> float:
     return stats.prewarm_hits / asked if asked else 0.0
 
 
-def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> None:
-    outcome = summary.outcome
-    times = [(name, f"{spent:.1f}", f"{share:.0%}") for name, spent, share in time_rows(outcome)]
-    parts = [
-        f"<h1>Training of {html.escape(outcome.model)}</h1>",
-        f"<p>{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts; "
-        f"{outcome.lost} rollouts lost to the infrastructure and masked; "
-        f"{prewarm_share(summary.stats):.0%} of announced scenes warm in time, "
-        f"{summary.stats.shared_share:.0%} of the steps shared. Machine: {html.escape(machine)}.</p>",
-        "<h2>Success on held-out tasks</h2>",
-        html_table([("tasks", "before GRPO", "after", "difference"), *success_rows(summary)])
-        if summary.after
-        else "<p>The dataset has no held-out tasks.</p>",
-        "<p>95 % bootstrap intervals over tasks.</p>",
-        "<h2>Learning curves</h2>",
-        *(_curve([row[key] for row in metrics], title, colour) for key, title, colour in _CURVES),
-        "<h2>Where the time went</h2>",
-        html_table([("activity", "seconds", "share"), *times]),
-        f"<p>Checkpoint: <code>{html.escape(str(summary.checkpoint))}</code></p>",
-    ]
-    style = "body { max-width: 720px; margin: 2rem auto; padding: 0 1rem; } svg { display: block; fill: currentColor; }"
-    page = f"{page_head('Training report')}<style>{style}</style></head><body>{''.join(parts)}</body></html>"
-    summary.report.write_text(page, encoding="utf-8")
-
-
-def _curve(series: Sequence[float | None], title: str, colour: str) -> str:
-    """Inline SVG with raw values (thin) and their moving average (bold). None values are skipped."""
-    steps = [at for at, value in enumerate(series) if value is not None]
-    values = [value for value in series if value is not None]
-    if not values:
-        return ""
-    low, high = min(*values, 0.0), max(values)
-    high = high if high > low else low + 1.0
-    window = max(1, len(values) // 20)
-    means = [sum(values[max(0, at - window + 1) : at + 1]) / min(at + 1, window) for at in range(len(values))]
-
-    def points(line: Sequence[float]) -> str:
-        across = (_WIDTH - 2 * _MARGIN) / max(1, len(series) - 1)
-        up = (_HEIGHT - 2 * _MARGIN) / (high - low)
-        return " ".join(
-            f"{_MARGIN + at * across:.1f},{_HEIGHT - _MARGIN - (value - low) * up:.1f}"
-            for at, value in zip(steps, line, strict=True)
-        )
-
-    text = 'font-size="12" opacity=".7"'
-    return (
-        f'<svg width="{_WIDTH}" height="{_HEIGHT}" role="img" aria-label="{html.escape(title)}">'
-        f'<text x="{_MARGIN}" y="24" font-size="14">{html.escape(title)}</text>'
-        f'<path d="M{_MARGIN} {_MARGIN}V{_HEIGHT - _MARGIN}H{_WIDTH - _MARGIN}" fill="none" stroke="#999"/>'
-        f'<text x="4" y="{_MARGIN + 4}" {text}>{high:.3g}</text>'
-        f'<text x="4" y="{_HEIGHT - _MARGIN}" {text}>{low:.3g}</text>'
-        f'<text x="{_WIDTH - _MARGIN}" y="{_HEIGHT - _MARGIN + 16}" {text} text-anchor="end">step {len(series)}</text>'
-        f'<polyline points="{points(values)}" fill="none" stroke="{colour}" stroke-opacity=".3"/>'
-        f'<polyline points="{points(means)}" fill="none" stroke="{colour}" stroke-width="2"/></svg>'
+def write_report(
+    summary: TrainingSummary,
+    source: TrainedOn,
+    metrics: Sequence[Mapping[str, Any]],
+    evaluations: Sequence[RecordedEvaluation],
+) -> None:
+    """Write the page. ``metrics`` are the records of the steps. Raises OSError."""
+    template = files("embomatrix.trainer.logging").joinpath("report.html").read_text(encoding="utf-8")
+    before, after = (_last(evaluations, label) for label in (BEFORE, AFTER))
+    title = f"Training of {summary.outcome.model}"
+    page = string.Template(template).substitute(
+        head=page_head(title),
+        plan_style=plan_style(),
+        title=html.escape(title),
+        about=html.escape(_about(summary, source)),
+        story=_story(summary),
+        curve=_held_out_curve(evaluations),
+        causes=_causes(before, after, source.tasks),
+        examples=_examples(before, after, source.tasks),
+        curves="".join(map(_section_of_curve, _drawn(metrics))),
+        times=_times(summary.outcome),
+        next=_next_steps(summary, source),
     )
+    write_whole(summary.report, page.encode("utf-8"))
+
+
+def machine_description() -> str:
+    """Cores, architecture and versions, for reports."""
+    return f"{usable_cores()} cores, {platform.machine()}, Python {platform.python_version()}, torch {torch.__version__}"
+
+
+def _about(summary: TrainingSummary, source: TrainedOn) -> str:
+    """When, how long, on what and with what the run trained, in one line."""
+    outcome, tasks = summary.outcome, source.tasks
+    minutes, seconds = divmod(round(outcome.wall_s), 60)
+    dataset = f"{tasks.folder}, " if tasks.folder is not None else ""
+    return " · ".join(
+        (
+            f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+            f"{minutes} min {seconds} s",
+            f"seed {source.seed}",
+            f"dataset {dataset}{len(tasks.train)} training and {len(tasks.heldout)} held-out tasks, digest "
+            f"{source.digest or 'unknown'}",
+            f"EmboMatrix {commit_here()}",
+            machine_description(),
+        )
+    )
+
+
+def _story(summary: TrainingSummary) -> str:
+    """Table of success by category, and what the run consisted of in a sentence."""
+    outcome, stats = summary.outcome, summary.stats
+    rows = success_rows(summary)
+    table = html_table([("tasks", "", "before GRPO", "after GRPO", "difference"), *rows]) if rows else ""
+    return (
+        f"{table or '<p>The dataset has no held-out tasks.</p>'}"
+        f"<p>{outcome.imitation_steps:,} steps of imitation, then {outcome.steps:,} of GRPO with "
+        f"{outcome.rollouts:,} rollouts. The infrastructure lost {outcome.lost:,} rollouts, which are masked. "
+        f"{prewarm_share(stats):.0%} of the announced scenes were warm in time, and {stats.shared_share:.0%} of the steps "
+        "were shared between plans.</p>"
+    )
+
+
+def _last(evaluations: Sequence[RecordedEvaluation], label: str) -> RecordedEvaluation | None:
+    return next((each for each in reversed(evaluations) if each.label == label and each.answers), None)
+
+
+def _categories(tasks: TaskSet) -> dict[str, TaskCategory]:
+    return {task.task.task_id: task.task.category for task in tasks.heldout}
+
+
+def _held_out_curve(evaluations: Sequence[RecordedEvaluation]) -> str:
+    """Curve of held-out success, empty for fewer than three evaluations: two are in the table."""
+    points = [(each.step, _success(each)) for each in evaluations if each.answers]
+    return (
+        f"<section><h2>Held-out success during GRPO</h2>{success_curve(points)}</section>"
+        if len(points) > 2
+        else ""
+    )
+
+
+def _success(evaluation: RecordedEvaluation) -> Interval:
+    by_task: dict[str, list[bool]] = {}
+    for answer in evaluation.answers:
+        if not answer.verdict.lost:
+            by_task.setdefault(answer.verdict.task_id, []).append(answer.verdict.success)
+    return mean_over_tasks([sum(found) / len(found) for found in by_task.values()]).interval
+
+
+def _causes(before: RecordedEvaluation | None, after: RecordedEvaluation | None, tasks: TaskSet) -> str:
+    """Section with the causes of failure before and after GRPO, empty without evaluations."""
+    if before is None or after is None:
+        return ""
+    boards = [each.board(_categories(tasks)) for each in (before, after)]
+    counts = [board.causes() for board in boards]
+    rows = [
+        (
+            cause.replace("_", " "),
+            *(
+                f"{found[cause] / max(1, board.samples - board.lost):.1%}"
+                for board, found in zip(boards, counts, strict=True)
+            ),
+            MEANINGS[cause],
+        )
+        for cause in Cause
+        if any(found[cause] for found in counts)
+    ]
+    if not rows:
+        return ""
+    table = html_table([("cause", "before GRPO", "after GRPO", "meaning"), *rows])
+    note = "Shares of all plans; the first failure of a plan counts."
+    return f"<section><h2>Why held-out plans failed</h2>{table}<p>{note}</p></section>"
+
+
+def _examples(before: RecordedEvaluation | None, after: RecordedEvaluation | None, tasks: TaskSet) -> str:
+    """Plans of three tasks before and after GRPO, side by side."""
+    if before is None or after is None:
+        return ""
+    parts = []
+    for example in examples_of(before, after, tasks):
+        task = example.after.task
+        parts += [
+            f"<h3 class='task'>{html.escape(task.task_id)}: {example.change}</h3>",
+            picture_section(example.before, "before GRPO"),
+            picture_section(example.after, "after GRPO"),
+        ]
+    return "".join(parts)
+
+
+def _drawn(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
+    drawn = [
+        step_curve(name, label, [row.get(name) for row in metrics], share=share)
+        for name, label, share in _CURVES
+    ]
+    return [curve for curve in drawn if curve]
+
+
+def _section_of_curve(curve: str) -> str:
+    return f'<section class="half">{curve}</section>'
+
+
+def _times(outcome: RunOutcome) -> str:
+    """Table of seconds and shares by activity, with a bar for each share."""
+    rows = "".join(
+        f"<tr><td>{html.escape(name)}</td><td>{spent:,.0f} s</td><td>{share:.0%}</td>"
+        f'<td><div class="bar"><i style="width:{min(1.0, share):.1%}"></i></div></td></tr>'
+        for name, spent, share in time_rows(outcome)
+    )
+    return f"<table><tr><th>activity</th><th>time</th><th>share</th><th></th></tr>{rows}</table>"
+
+
+def _next_steps(summary: TrainingSummary, source: TrainedOn) -> str:
+    """Commands that use the result."""
+    dataset = source.tasks.folder or "DATASET"
+    commands = (
+        (
+            f"embomatrix eval --bench {dataset} --model {summary.checkpoint / 'policy'}",
+            "scores it on the held-out tasks",
+        ),
+        (
+            f"embomatrix train --resume --dataset {dataset} --out {summary.report.parent} --steps {2 * summary.outcome.steps}",
+            "continues the run",
+        ),
+    )
+    lines = (
+        f"<li><code>{html.escape(command)}</code> {html.escape(what)}</li>" for command, what in commands
+    )
+    return f"<ul>{''.join(lines)}</ul>"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import platform
 import resource
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from embomatrix.host.limits import usable_cores
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.settings import SeedPer
 from embomatrix.trainer.data.tasks import Curriculum, Schedule, training_seed
@@ -28,9 +26,10 @@ from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.logging.dashboard import DashboardReporter
+from embomatrix.trainer.logging.evaluations import AFTER, BEFORE, DURING, EVALUATIONS, read_evaluations
 from embomatrix.trainer.logging.outcome import RunOutcome, write_outcome
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.logging.report import REPORT, TrainingSummary, rates_of, write_report
+from embomatrix.trainer.logging.report import REPORT, TrainedOn, TrainingSummary, rates_of, write_report
 from embomatrix.trainer.logging.trackers import Tracker
 from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.run.imitation import run_imitation
@@ -75,9 +74,10 @@ class TrainingRun:
         earlier_s = sum(self._progress.spent_s.values())
         reference = self._start.reference or self._prepare()
         checkpoint = self._grpo(reference)
-        after = self._evaluate("after GRPO")
+        after = self._evaluate(AFTER, self._settings.evaluation.samples)
         summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
-        write_report(summary, read_metrics(self._out), machine_description())
+        source = TrainedOn(self._start.tasks, self._progress.dataset, self._settings.seed)
+        write_report(summary, source, read_metrics(self._out), read_evaluations(self._out))
         write_outcome(self._out, summary.outcome)
         return summary
 
@@ -92,7 +92,7 @@ class TrainingRun:
             newest = self._store.latest() if self._resumed else None
             if newest is not None:
                 restore(newest, functools.partial(self._load_tensors, updater))
-            self._recorder.forget_after(self._progress.step, METRICS, SAMPLES)
+            self._recorder.forget_after(self._progress.step, METRICS, SAMPLES, EVALUATIONS)
             try:
                 self._optimise(updater)
             finally:
@@ -108,15 +108,15 @@ class TrainingRun:
         policy, progress = self._start.policy, self._progress
         with self._stopwatch.track(Activity.IMITATION):
             run_imitation(self._start, self._out, self._recorder, self._display.imitation)
-        before = self._evaluate("before GRPO")
+        before = self._evaluate(BEFORE, self._settings.evaluation.samples)
         progress.before = before.as_json() if before else []
         with atomic_folder(self._out / REFERENCE) as folder:
             policy.save(folder)
         progress.grpo_ready = True
         return policy.frozen_copy()
 
-    def _evaluate(self, label: str) -> HeldOutEvaluation | None:
-        start, settings = self._start, self._settings
+    def _evaluate(self, label: str, samples: int) -> HeldOutEvaluation | None:
+        start, settings, step = self._start, self._settings, self._progress.step
         if not start.tasks.heldout:
             return None
         with self._stopwatch.track(Activity.EVALUATION):
@@ -126,14 +126,22 @@ class TrainingRun:
                 start.tasks.heldout,
                 self._gateway,
                 settings.evaluation,
+                samples=samples,
                 max_new=settings.grpo.max_new,
                 seed=settings.seed,
-                label=label.replace(" ", "-"),
+                label=f"{label.replace(' ', '-')}-{step}",
                 report=lambda done, total: self._display.evaluating(label, done, total),
             )
         self._display.evaluated(label, result)
-        self._recorder.evaluation(label, result)
+        self._recorder.evaluation(step, label, result)
         return result
+
+    def _evaluate_if_due(self, done: set[int]) -> None:
+        """Evaluate after every so many steps. ``done`` are the steps with an evaluation; a resumed run repeats none."""
+        settings, step = self._settings.evaluation, self._progress.step
+        if settings.every and step and step % settings.every == 0 and step not in done:
+            self._evaluate(DURING, settings.samples_during)
+            done.add(step)
 
     def _optimise(self, updater: Updater) -> None:
         settings = self._settings.grpo
@@ -142,7 +150,9 @@ class TrainingRun:
         curriculum = Curriculum(settings.curriculum_tasks, settings.curriculum_start)
         schedule = Schedule(tasks, seed=seed, cursor=progress.cursor, curriculum=curriculum)
         reserve = Schedule(tasks, seed=seed, cursor=progress.reserve_cursor, stream=RESERVE_STREAM)
+        evaluated = {each.step for each in read_evaluations(self._out)}
         while (share := self._share()) < 1.0:
+            self._evaluate_if_due(evaluated)
             began_s = time.monotonic()
             self._announce(schedule, reserve, progress.step)
             with DeferredInterrupts() as interrupts:
@@ -265,8 +275,3 @@ class TrainingRun:
         )
         stats = self._gateway.close_run()
         return TrainingSummary(outcome, before, after, stats, checkpoint, self._out / REPORT)
-
-
-def machine_description() -> str:
-    """Cores, architecture and versions, for reports."""
-    return f"{usable_cores()} cores, {platform.machine()}, Python {platform.python_version()}, torch {torch.__version__}"

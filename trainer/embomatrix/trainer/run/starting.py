@@ -28,6 +28,7 @@ CHANGEABLE: Final = frozenset(
     {
         *("device", "threads", "processes", "track", "checkpoint_every", "keep_checkpoints", "samples_every"),
         *("grpo.minutes", "grpo.steps", "imitation.seconds", "imitation.steps", "imitation.chunk"),
+        *("evaluation.every", "evaluation.samples_during"),
     }
 )
 """Settings that may change on resume: budget, hardware, memory use and logging."""

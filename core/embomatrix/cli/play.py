@@ -1,4 +1,7 @@
-"""``embomatrix play``: execute a plan in a task and explain every step and the reward."""
+"""``embomatrix play``: execute a plan in a task and explain every step and the reward.
+
+The plan is a person's, the oracle's or a trained policy's.
+"""
 
 import os
 import sys
@@ -24,6 +27,7 @@ from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.state.facts import FactError
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.parse import PlanError, parse_plan
+from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for, situation_of
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, Plan
 from embomatrix.skills.trace import Trace
 from embomatrix.world.bundle import Bundle
@@ -59,6 +63,16 @@ def play(
         ),
     ] = "",
     oracle: Annotated[bool, typer.Option("--oracle", help="Execute the oracle planner's plan.")] = False,
+    policy: Annotated[
+        Path | None,
+        typer.Option(help="Execute the plan of a trained policy: the folder of a run, such as runs/demo."),
+    ] = None,
+    show: Annotated[
+        bool,
+        typer.Option(
+            "--show", help="Print the object table and the prompt that a model gets; execute nothing."
+        ),
+    ] = False,
     dataset: Annotated[
         Path | None,
         typer.Option(help=f"Folder of the dataset. Default: $EMBOMATRIX_DATASET, or {DEFAULT_DATASET}."),
@@ -81,40 +95,68 @@ def play(
             # Drawing takes minutes, so an unwritable path fails before anything is executed.
             check_suffix(film)
             check_writable(film)
-        _play(task, plan, oracle, dataset, mode, seed, film)
+        if sum((bool(plan), oracle, policy is not None, show)) != 1:
+            fail("expected one of --plan FILE, --oracle, --policy FOLDER and --show: give one of them")
+        root = dataset if dataset is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
+        data = Dataset.load(root)
+        record = data.find(task)
+        bundle = data.bundle(record.bundle_digest)
+        text = _text_of(plan) if plan else None
+        _show_task(record.task)
+        if show:
+            _show_prompt(bundle, record.task)
+        else:
+            found = _plan_of(bundle, record.task, text, policy, seed)
+            _run(bundle, record.task, found, mode, seed, film)
 
 
-def _play(
-    task_id: str,
-    plan: str,
-    oracle: bool,
-    folder: Path | None,
-    mode: PlayMode,
-    seed: int,
-    film: Path | None,
-) -> None:
-    if oracle == bool(plan):
-        fail("expected either --plan FILE or --oracle: give one of them")
-    root = folder if folder is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
-    data = Dataset.load(root)
-    record = data.find(task_id)
-    bundle = data.bundle(record.bundle_digest)
-    text = "" if oracle else _text_of(plan)
-    _show_task(record.task)
-    if oracle:
-        found = find_plan(load_simulator(bundle), record.task)
+def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: Path | None, seed: int) -> Plan:
+    """Parse the text, or ask the policy, or else the oracle. Exit if there is no plan."""
+    if text is None and policy is None:
+        found = find_plan(load_simulator(bundle), task)
         if isinstance(found, PlanNotFound):
-            fail(f"the oracle finds no plan for {task_id!r}: {found.reason}")
-    else:
-        try:
-            found = parse_plan(text, record.task.profile)
-        except PlanError as error:
-            console.print(
-                f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}"
-            )
-            _show_reward(unparsable())
-            raise typer.Exit(NO_PLAN) from None
-    _run(bundle, record.task, found, mode, seed, film)
+            fail(f"the oracle finds no plan for {task.task_id!r}: {found.reason}")
+        return found
+    try:
+        if policy is not None:
+            return _plan_of_policy(policy, situation_of(bundle.scene, task), seed)
+        return parse_plan(text or "", task.profile)
+    except PlanError as error:
+        console.print(f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}")
+        _show_reward(unparsable())
+        raise typer.Exit(NO_PLAN) from None
+
+
+def _plan_of_policy(folder: Path, situation: Situation, seed: int) -> Plan:
+    """Return the most probable plan of a trained policy. Raises PlanError if it writes none."""
+    import torch
+
+    from embomatrix.trainer.cluster.gateway import parse_policy_text
+    from embomatrix.trainer.config.errors import TrainerError
+    from embomatrix.trainer.evaluation.models import load_model
+
+    try:
+        policy, settings = load_model(str(folder), None, threads=None, device="cpu")
+    except TrainerError as error:
+        fail(str(error))
+    asked = limited(situation, settings.prompt.rows)
+    prompt = policy.encode(prompt_for(asked, policy.codec))
+    drawn = policy.sample([prompt], 1, 0.0, settings.grpo.max_new, torch.Generator().manual_seed(seed))
+    return parse_policy_text(drawn.texts[0], asked, policy.codec)
+
+
+def _show_prompt(bundle: Bundle, task: Task) -> None:
+    """Print the object table, and the prompt for plans of one call per line."""
+    table = Table("row", "object", "category", "room", title="Object table", title_justify="left")
+    for row, name in enumerate(task.table):
+        item = bundle.scene.by_name[name]
+        table.add_row(
+            str(row), escape(name), escape(bundle.scene.assets[item.asset_id].category), escape(item.room)
+        )
+    console.print(table)
+    prompt = prompt_for(situation_of(bundle.scene, task), Codec.LINES)
+    console.print("\n[bold]Prompt[/bold]")
+    console.print(printable(f"{prompt.system}\n\n{prompt.user}", lines=True), markup=False, soft_wrap=True)
 
 
 def _text_of(plan: str) -> str:

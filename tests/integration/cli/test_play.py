@@ -8,7 +8,11 @@ from PIL import Image
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from typer.testing import CliRunner
 
-from embomatrix.factory.commands.play import play
+from embomatrix.cli.play import play
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
+from embomatrix.trainer.policy.loading import new_policy
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord, write_dataset
 from embomatrix.world.inflation import bundle_digest
@@ -94,6 +98,35 @@ def test_index_outside_the_table_is_a_failed_step(run):
     assert "unknown_index: there is no object with index 9999: the table has indices 0 to 14" in printed
 
 
+def test_empty_plan_is_no_request_for_the_oracle(run):
+    result = run("apple_to_counter", "--plan", "-", text="")
+    assert result.exit_code == 1
+    assert "no plan was found" in " ".join(result.output.split())
+
+
+def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
+    result = run("apple_to_counter", "--show")
+    assert result.exit_code == 0
+    printed = " ".join(result.output.split())
+    assert "│ 10 │ apple_1 │ apple │ kitchen_0 │" in printed
+    assert "You control a home robot." in printed
+    assert "Reward" not in printed
+
+
+def test_newest_checkpoint_of_a_run_writes_the_plan(run, folder, tmp_path):
+    tasks = load_tasks(folder)
+    settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16})
+    store = CheckpointStore(tmp_path / CHECKPOINTS, keep=2)
+    for step in (1, 2):
+        store.save(new_policy(settings, tasks), {}, TrainingProgress(step=step, grpo_ready=True), settings)
+    result = run("apple_to_counter", "--policy", str(tmp_path))
+    assert result.exit_code in (0, 1), result.output
+    assert "Reward" in result.output
+    refused = run("apple_to_counter", "--policy", str(tmp_path / "nothing"))
+    assert refused.exit_code == 2
+    assert "nothing" in refused.output
+
+
 def test_oracle_option_solves_the_task(run):
     result = run("cook_chicken", "--oracle")
     assert result.exit_code == 0
@@ -105,8 +138,12 @@ def test_oracle_option_solves_the_task(run):
     ("arguments", "env", "words"),
     [
         (("cook_chiken", "--oracle"), {}, "there is no task 'cook_chiken'"),
-        (("cook_chicken",), {}, "expected either --plan FILE or --oracle"),
-        (("cook_chicken", "--oracle", "--plan", "-"), {}, "expected either --plan FILE or --oracle"),
+        (("cook_chicken",), {}, "expected one of --plan FILE, --oracle, --policy FOLDER and --show"),
+        (
+            ("cook_chicken", "--oracle", "--plan", "-"),
+            {},
+            "expected one of --plan FILE, --oracle, --policy FOLDER and --show",
+        ),
         (("cook_chicken", "--plan", "/no/such/plan"), {}, "No such file or directory"),
         (
             ("cook_chicken", "--oracle"),
