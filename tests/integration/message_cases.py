@@ -202,7 +202,7 @@ COMMANDS = (
     ),
     CommandCase("negative minutes", "train --minutes=-1", "--minutes", "greater than or equal to 0"),
     CommandCase("option without number", "train --steps=many", "--steps", "valid integer"),
-    CommandCase("missing argument", "factory list", "'folder'", "Try 'embomatrix factory list --help'"),
+    CommandCase("missing argument", "factory export", "'folder'", "Try 'embomatrix factory export --help'"),
     CommandCase(
         "model without endpoint",
         "factory agent scene-extractor --in=FILES/brief.json --llm=http://localhost:1/v1",

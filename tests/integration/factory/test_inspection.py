@@ -133,6 +133,25 @@ def test_scene_pictures_are_rendered_once(dataset, tmp_path):
     assert (wrong.exit_code, "there is no dataset" in " ".join(wrong.output.split())) == (2, True)
 
 
+def test_export_replaces_its_own_files_but_no_others(dataset, tmp_path):
+    def export(*options):
+        return CliRunner().invoke(
+            app, ["export", str(dataset.folder), "--out", str(tmp_path / "t.jsonl"), *options]
+        )
+
+    notes = tmp_path / "README.md"
+    notes.write_text("my notes")
+    refused = export()
+    assert refused.exit_code == 2
+    assert "README.md was not written by an export" in " ".join(refused.stderr.split())
+    assert notes.read_text() == "my notes"
+    assert not (tmp_path / "t.jsonl").exists()
+    assert export("--force").exit_code == 0
+    assert export().exit_code == 0, "its own files may be replaced"
+    notes.unlink()
+    assert "t.jsonl was not written by an export" in " ".join(export().stderr.split())
+
+
 def test_every_task_is_exported_with_every_field(dataset):
     rows = export_rows(dataset)
     assert [row["task_id"] for row in rows] == [record.task.task_id for record in dataset.records]

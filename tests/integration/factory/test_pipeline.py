@@ -293,10 +293,29 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def test_list_shows_the_tasks(folder: Path, dataset: Dataset) -> None:
-    code, output = run("list", str(folder))
+    code, output = run("list", str(folder), "--limit=1000")
     assert code == 0
     assert "heldout" in output
-    assert all(f" {record.task.task_id} " in output for record in dataset.records)
+    assert all(f"{record.task.task_id}\n" in output for record in dataset.records)
+    assert f"of {len(dataset.records)}" in output
+
+
+def test_list_selects_tasks_and_shows_them_in_pages(folder: Path, dataset: Dataset) -> None:
+    code, output = run("list", str(folder), "--json", "--split=heldout")
+    assert code == 0
+    assert [each["task"] for each in json.loads(output)] == [
+        record.task.task_id for record in dataset.heldout
+    ]
+    one = dataset.records[0].task
+    wanted = (f"--search={one.task_id}", f"--scene={one.scene_id}", f"--category={one.category}")
+    code, output = run("list", str(folder), *wanted)
+    assert (code, "tasks 1 to 1 of 1\n" in output) == (0, True), output
+    code, output = run("list", str(folder), "--limit=1", "--page=2")
+    assert code == 0
+    assert dataset.records[1].task.task_id in output
+    assert dataset.records[0].task.task_id not in output
+    assert "none of" in run("list", str(folder), "--search=no such words")[1]
+    assert run("list", str(folder), "--split=test")[0] == 2
 
 
 def test_bddl_file_is_imported_and_its_plan_printed(tmp_path: Path) -> None:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Column
 
 from embomatrix.factory.commands.agents import agent
 from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.build import make_dataset
 from embomatrix.factory.commands.corpus import corpus
+from embomatrix.factory.commands.datasets import export, list_, prompts
 from embomatrix.factory.commands.difficulty import difficulty
 from embomatrix.factory.commands.evaluate import evaluate
 from embomatrix.factory.commands.faithfulness import audit
@@ -38,22 +38,33 @@ from embomatrix.factory.commands.verification import verify
 from embomatrix.factory.days.maker import DAYS, days_planned_by
 from embomatrix.factory.days.model_days import ModelDays
 from embomatrix.factory.days.planning import plan_day
-from embomatrix.factory.evaluate.readings import prompts_of
 from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
-from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
 from embomatrix.host.commands import command_group
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.rpc.options import Ca, Token
-from embomatrix.world.dataset import Dataset
-from embomatrix.world.whole_file import write_whole
 
 app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
-for command in (agent, lay, inspect, pictures, corpus, starter, merge, verify, audit, evaluate, difficulty):
+app.command("list")(list_)
+for command in (
+    agent,
+    lay,
+    inspect,
+    pictures,
+    corpus,
+    starter,
+    merge,
+    verify,
+    audit,
+    evaluate,
+    difficulty,
+    prompts,
+    export,
+):
     app.command()(command)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
@@ -190,62 +201,3 @@ def _print_account(ledger: Ledger, admitted: int) -> None:
     tokens = total.prompt_tokens + total.completion_tokens
     if admitted and total.calls:
         say(f"{total.calls / admitted:.1f} calls and {tokens / admitted:,.0f} tokens for each admitted task")
-
-
-@app.command("list")
-def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) -> None:
-    """List the tasks of a dataset."""
-    with user_errors():
-        dataset = Dataset.load(folder)
-    # Other commands take the task's id as an argument, so the column never truncates it.
-    columns = (
-        Column("task", no_wrap=True),
-        "split",
-        "category",
-        "rows",
-        "steps",
-        "difficulty",
-        "instruction",
-    )
-    rows = (
-        (
-            task.task_id,
-            record.split,
-            task.category,
-            len(task.table),
-            len(record.oracle),
-            "" if record.difficulty is None else record.difficulty.level,
-            task.instruction,
-        )
-        for record in dataset.records
-        for task in (record.task,)
-    )
-    show_table(columns, rows)
-
-
-@app.command()
-def prompts(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
-    out: Annotated[Path, typer.Option(help="Text file to write.")],
-    tasks: Annotated[int, typer.Option(min=1, help="Number of held-out tasks.")] = 40,
-) -> None:
-    """Write the prompts of held-out tasks, without their goals, for a person or a model to answer."""
-    with user_errors(out):
-        write_whole(out, prompts_of(Dataset.load(folder), tasks).encode("utf-8"))
-    say(f"prompts: {out}; `factory evaluate readings` judges the answers")
-
-
-@app.command()
-def export(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
-    out: Annotated[
-        Path, typer.Option(help="File to write, .jsonl or .parquet. The card is written beside it.")
-    ],
-) -> None:
-    """Export a dataset for other tools, one row per task, with a dataset card."""
-    with user_errors(out):
-        dataset = Dataset.load(folder)
-        data = encode_rows(export_rows(dataset), out.suffix)
-        write_whole(out, data)
-        write_whole(out.with_name("README.md"), dataset_card(dataset, out.name, data).encode("utf-8"))
-    say(f"{len(dataset.records)} tasks: {out}, card: {out.with_name('README.md')}")

@@ -37,6 +37,8 @@ FIELDS: Final[Mapping[str, str]] = {
 }
 MIT_SOURCES: Final = frozenset(("writer", "behavior-1k", "embomatrix"))
 """Sources of tasks whose text is under the MIT licence."""
+CARD_MARK: Final = "pretty_name: EmboMatrix tasks"
+"""Line in the header of each card."""
 SUFFIXES: Final = (".jsonl", ".parquet")
 
 
@@ -98,7 +100,7 @@ def dataset_card(dataset: Dataset, file_name: str, data: bytes) -> str:
     lines = [
         "---",
         "language: en",
-        "pretty_name: EmboMatrix tasks",
+        CARD_MARK,
         *_licence(records),
         "task_categories: [robotics]",
         *_configs(file_name),
@@ -109,7 +111,7 @@ def dataset_card(dataset: Dataset, file_name: str, data: bytes) -> str:
         f"{len(records):,} household tasks in {len(scenes)} base scenes, each with an oracle plan that reaches the "
         f"goal in the simulator. {len(kinds):,} kinds of goals.",
         "",
-        f"File: `{file_name}`, SHA-256 `{hashlib.sha256(data).hexdigest()}`.",
+        f"{_file_line(file_name)}, SHA-256 `{hashlib.sha256(data).hexdigest()}`.",
         "",
         *_counts(records),
         "",
@@ -135,6 +137,15 @@ def dataset_card(dataset: Dataset, file_name: str, data: bytes) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def is_card_of(text: str, file_name: str) -> bool:
+    """True if the text is the card that was written beside an export of this name."""
+    return CARD_MARK in text.splitlines() and _file_line(file_name) in text
+
+
+def _file_line(file_name: str) -> str:
+    return f"File: `{file_name}`"
 
 
 def _counts(records: Sequence[TaskRecord]) -> list[str]:
