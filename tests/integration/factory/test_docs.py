@@ -7,9 +7,9 @@ from pathlib import Path
 import typer
 from tests.fakes.scenes import kitchen_scene
 
+from embomatrix.cli.play import play
 from embomatrix.factory.admission import RefusalReason
 from embomatrix.factory.commands import app as cli
-from embomatrix.factory.commands import play as play_cli
 from embomatrix.factory.commands import scenes as scene_cli
 from embomatrix.factory.task_import.reach import HELD
 from embomatrix.factory.task_import.sources import SourceText
@@ -70,7 +70,7 @@ def test_problem_on_the_page_can_be_bound():
 
 def test_commands_on_the_page_exist_with_their_options():
     apps = {"factory": cli.app, "scene": scene_cli.app, "play": typer.Typer()}
-    apps["play"].command()(play_cli.play)
+    apps["play"].command()(play)
     for name, rest in re.findall(r"^embomatrix (\w+) (.*?)(?:#.*)?$", PAGE, re.MULTILINE):
         command = typer.main.get_command(apps[name])
         for word in rest.split()[:2]:
