@@ -488,13 +488,19 @@ COMMANDS = (
         "checkpoint folder without checkpoint",
         "eval --model=FILES/empty --bench=KITCHEN",
         "FILES/empty",
-        "expected runs/NAME/checkpoints",
+        "expected runs/NAME",
+    ),
+    CommandCase(
+        "manager with a missing dataset",
+        "manager serve --dataset=FILES/nothing",
+        "there is no dataset in FILES/nothing",
+        "get the shipped one with `embomatrix factory starter",
     ),
     CommandCase(
         "damaged checkpoint",
         "eval --model=FILES/cut_checkpoint --bench=KITCHEN",
         "FILES/cut_checkpoint",
-        "expected runs/NAME/checkpoints",
+        "expected runs/NAME",
     ),
     CommandCase(
         "no manager",

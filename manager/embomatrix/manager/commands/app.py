@@ -19,6 +19,7 @@ from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings, g
 from embomatrix.rpc.status import ClusterError, InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca, read_token
 from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
+from embomatrix.world.dataset import Dataset, DatasetError
 
 if TYPE_CHECKING:
     from embomatrix.rpc.admin_client import AdminClient
@@ -66,7 +67,18 @@ def serve(
     file = read_config(config, _refuse) if config is not None else {}
     settings = _settings(given_options(context), file)
     hide(settings.token)
+    _check_dataset(settings.dataset)
     _serve(settings)
+
+
+def _check_dataset(folder: Path | None) -> None:
+    """Refuse a dataset that can't be shown, before anything is served."""
+    if folder is None:
+        return
+    try:
+        Dataset.load(folder)
+    except DatasetError as error:
+        _refuse(str(error))
 
 
 add_settings(serve, ManagerSettings, skip=ManagerSettings.model_fields.keys() - OPTIONS)

@@ -41,7 +41,8 @@ def load_model(
         return saved_policy(folder, settings), settings
     if folder.is_dir() and not HfPolicy.is_saved_in(folder):
         raise TrainerError(
-            f"{folder} is not a model: expected a run such as runs/NAME, one of its checkpoints, or a folder with config.json"
+            f"{folder} is not a model: expected runs/NAME, one of its checkpoints (runs/NAME/checkpoints/step-000050), or a "
+            "folder with config.json"
         )
     written = codec or HfPolicy.codec_in(folder) or Codec.JSON
     settings = read_settings(None, {"device": device, "codec": written}, LANGUAGE_MODEL_DEFAULTS)
