@@ -6,6 +6,7 @@ from pathlib import Path
 
 import typer
 from tests.fakes.scenes import kitchen_scene
+from typer.testing import CliRunner
 
 from embomatrix.cli.play import play
 from embomatrix.factory.admission import RefusalReason
@@ -17,7 +18,7 @@ from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.world.codec_task import task_to_json
-from embomatrix.world.dataset import SPLITS, TaskRecord, record_to_json
+from embomatrix.world.dataset import SPLITS, Dataset, TaskRecord, record_to_json
 from embomatrix.world.difficulty import Difficulty
 from embomatrix.world.intent import IntentClause
 from embomatrix.world.task import MAX_TABLE, Profile, TaskCategory
@@ -64,8 +65,18 @@ def test_categories_splits_and_predicates_stand_there():
     assert set(predicates.split()) == HELD
 
 
-def test_problem_on_the_page_can_be_bound():
+def test_problem_on_the_page_is_imported_by_the_command_on_the_page(tmp_path, monkeypatch):
     assert imported().task.instruction == "Put the apple in the fridge."
+    problem = re.search(r"```lisp\n(.*?)```", PAGE, re.DOTALL)
+    command = re.search(r"^embomatrix factory (import --bddl .*?) +#", PAGE, re.MULTILINE)
+    assert problem
+    assert command
+    arguments = command[1].split()
+    monkeypatch.chdir(tmp_path)
+    Path(arguments[arguments.index("--bddl") + 1]).write_text(problem[1], encoding="utf-8")
+    done = CliRunner().invoke(cli.app, arguments)
+    assert done.exit_code == 0, done.output + done.stderr
+    assert len(Dataset.load(arguments[arguments.index("--out") + 1]).records) == 1
 
 
 def test_commands_on_the_page_exist_with_their_options():
