@@ -111,23 +111,39 @@ _NAMED: Final[Mapping[str, type[ClusterError]]] = {"unknown-session": UnknownSes
 """Errors that share a status with others, by the value of ``ERROR_KEY`` that identifies them."""
 _NAMES: Final = {error: name for name, error in _NAMED.items()}
 
-_TLS_TROUBLES: Final[Mapping[str, str]] = {
-    "WRONG_VERSION_NUMBER": "the server at {address} does not speak TLS: leave --ca out, or check the port",
+_TROUBLES: Final[Mapping[str, tuple[type[ClusterError], str]]] = {
+    # Time does not mend the first two: they are no ManagerUnreachableError, so nobody waits for a manager there.
+    "http1.x server": (
+        PreconditionError,
+        "a web page answers at {address}, and no manager: pass the port that `embomatrix manager serve` prints first, 50070 "
+        "unless you chose another",
+    ),
+    "WRONG_VERSION_NUMBER": (
+        PreconditionError,
+        "the server at {address} does not speak TLS: leave --ca out, or check the port",
+    ),
     "[Hh]andshake failed": (
+        ManagerUnreachableError,
         "the certificate at {address} is not signed by the authority in --ca, or has expired: pass the ca.pem of that manager, "
-        "or renew it with `embomatrix manager init`"
+        "or renew it with `embomatrix manager init`",
     ),
     "Hostname Verification": (
+        ManagerUnreachableError,
         "the certificate at {address} is for other names: use one of them, or add this one with "
-        "`embomatrix manager init --san NAME`"
+        "`embomatrix manager init --san NAME`",
     ),
     # Only while connecting: a manager that dies closes its connections too.
     "failed to connect .*Socket closed": (
+        ManagerUnreachableError,
         "the server at {address} closed the connection: if it speaks TLS, pass --ca, or set EMBOMATRIX_CA, to the ca.pem "
-        "of that manager"
+        "of that manager",
+    ),
+    "address lookup failed|[Nn]ame resolution": (
+        ManagerUnreachableError,
+        "the host of {address} is unknown: check its spelling and this machine's network, or pass an IP address",
     ),
 }
-"""Patterns of gRPC's handshake errors and their explanations. The first match counts."""
+"""Patterns of gRPC's errors while connecting, and their explanations. The first match counts."""
 
 
 @contextlib.asynccontextmanager
@@ -204,8 +220,9 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
     if ERROR_KEY in trailers:
         return (_NAMED.get(trailers[ERROR_KEY]) or _ERRORS.get(code, InternalError))(details)
     match code:
-        case grpc.StatusCode.UNAVAILABLE if trouble := _tls_trouble(details):
-            return ManagerUnreachableError(trouble.format(address=address))
+        case grpc.StatusCode.UNAVAILABLE if trouble := _trouble(details):
+            kind, sentence = trouble
+            return kind(sentence.format(address=address))
         case grpc.StatusCode.UNAVAILABLE:
             return ManagerUnreachableError(
                 f"no manager answers at {address}: start one with `embomatrix manager serve`, "
@@ -226,9 +243,9 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
             )
 
 
-def _tls_trouble(details: str) -> str:
-    """Return the explanation of a failed TLS handshake; empty for other failures."""
-    return next((sentence for sign, sentence in _TLS_TROUBLES.items() if re.search(sign, details)), "")
+def _trouble(details: str) -> tuple[type[ClusterError], str] | None:
+    """Return the kind and the explanation of a failed connection; None if gRPC's details don't tell."""
+    return next((found for sign, found in _TROUBLES.items() if re.search(sign, details)), None)
 
 
 @contextlib.contextmanager

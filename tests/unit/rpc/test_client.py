@@ -1,5 +1,7 @@
 """Client: one outcome per rollout across broken streams, and readable errors."""
 
+import asyncio
+
 import pytest
 from tests.fakes.cluster import FakeCluster, serving
 
@@ -77,6 +79,28 @@ async def test_absent_manager_is_named_with_the_remedy():
     async with ClusterClient("127.0.0.1:1", limits=LIMITS) as client:
         with pytest.raises(
             ManagerUnreachableError, match=r"no manager answers at 127\.0\.0\.1:1: start one with"
+        ):
+            await client.open_run("demo")
+
+
+async def test_web_page_at_the_address_is_no_manager_that_may_come_back():
+    async def answer(reader, writer):
+        await reader.read(64)
+        writer.write(b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n")
+        await writer.drain()
+        writer.close()
+
+    async with await asyncio.start_server(answer, "127.0.0.1", 0) as page:
+        address = f"127.0.0.1:{page.sockets[0].getsockname()[1]}"
+        async with ClusterClient(address, limits=LIMITS) as client:
+            with pytest.raises(PreconditionError, match=f"a web page answers at {address}"):
+                await client.open_run("demo")
+
+
+async def test_unknown_host_is_named():
+    async with ClusterClient("no-such-host.invalid:50070", limits=LIMITS) as client:
+        with pytest.raises(
+            ManagerUnreachableError, match=r"the host of no-such-host\.invalid:50070 is unknown"
         ):
             await client.open_run("demo")
 
