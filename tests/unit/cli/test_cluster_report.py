@@ -129,6 +129,14 @@ def test_empty_run_has_a_report():
     assert "None: every lease brought a result." in page
 
 
+def test_leases_that_were_given_again_are_told_where_none_failed():
+    calm = summary(failures=())
+    assert calm.run.stats.redispatched == 2
+    page = report_page(calm, EVENTS)
+    assert "No lease failed. 2 rollouts were leased again" in page
+    assert "every lease brought a result" not in page
+
+
 def test_report_states_dropped_events():
     assert "1,234 earlier ones were dropped" in report_page(summary(events_dropped=1234), EVENTS)
 

@@ -50,10 +50,14 @@ def test_overhead_covers_the_last_minute():
     load.sample(0.0, 0.0, 0.0)
     assert load.overhead() == 0.0
     load.sample(10.0, 9.0, 1.0)
-    assert load.overhead() == 0.9
-    for second in range(20, 200, 10):
-        load.sample(second, 9.0 + second / 10, 1.0 + second * 0.9)
-    assert load.overhead() == pytest.approx(0.1)
+    assert load.overhead() == 0.0, "the slots hardly worked: the share would say nothing"
+    load.sample(20.0, 9.0, 9.0)
+    assert load.overhead() == 0.5
+    for second in range(30, 200, 10):
+        load.sample(second, 9.0 + second / 10, 9.0 + second * 1.8)
+    assert load.overhead() == pytest.approx(0.1 / 1.9)
+    assert load.core_share() == pytest.approx(0.1)
+    assert load.slots_at_work() == pytest.approx(1.8)
 
 
 async def test_store_operations_are_timed():

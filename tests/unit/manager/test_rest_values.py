@@ -56,6 +56,11 @@ def test_health_reports_the_most_important_fact():
         "3 of 10 workers were lost recently; their leases were re-dispatched.",
     )
     assert "slot_crashed" in mood(workers={"ready": 12, "lost": 3}, failures=[NOTE])[1]
+    assert mood(overhead=0.4, core_share=0.3) == (Mood.GOOD, "All is well."), "its core has room"
+    assert mood(core_share=0.9) == (
+        Mood.WARNING,
+        "The manager uses 90% of its core: send larger batches, or give it a faster core.",
+    )
     assert mood(leased=0)[1] == "3 rollouts are queued and none runs: no scene is warm yet."
     full = "the state file can't be written: make room on its disk"
     assert mood(store=full, paused=True) == (

@@ -184,6 +184,12 @@ def _worker_rows(summary: RunSummary) -> str:
 
 def _failures(summary: RunSummary) -> str:
     if not summary.failures:
+        again = summary.run.stats.redispatched
+        if again:
+            return (
+                f'<p class="none">No lease failed. {again:,} rollouts were leased again because their worker left, drained or '
+                "fell silent before it had a result.</p>"
+            )
         return '<p class="none">None: every lease brought a result.</p>'
     codes = Counter(event.code for event in summary.failures)
     counts = ", ".join(f"{count} {code}" for code, count in codes.most_common())

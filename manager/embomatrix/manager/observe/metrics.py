@@ -10,6 +10,8 @@ from embomatrix.manager.histogram import Histogram, quantile
 from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure, RolloutResult
 
 WINDOW_S: Final = 60.0
+LEAST_WORK_S: Final = 3.0
+"""Work of all slots in the window below which the manager's share says nothing: its idle time would count."""
 
 
 class _Sample(NamedTuple):
@@ -47,12 +49,26 @@ class ManagerLoad:
             self._samples.popleft()
 
     def overhead(self) -> float:
-        """Return the manager's share of the CPU time of manager and slots in the last minute; 0 if nothing ran."""
+        """Return the manager's share of the CPU time of manager and slots in the last minute; 0 if hardly anything ran."""
+        _, manager_s, slots_s = self._spent()
+        return manager_s / (manager_s + slots_s) if slots_s >= LEAST_WORK_S else 0.0
+
+    def core_share(self) -> float:
+        """Return the share of one core that the manager used in the last minute."""
+        seconds, manager_s, _ = self._spent()
+        return manager_s / seconds if seconds > 0 else 0.0
+
+    def slots_at_work(self) -> float:
+        """Return the mean number of slots that executed plans in the last minute."""
+        seconds, _, slots_s = self._spent()
+        return slots_s / seconds if seconds > 0 else 0.0
+
+    def _spent(self) -> _Sample:
+        """Return the length of the window, and the CPU time in it."""
         if len(self._samples) < 2:
-            return 0.0
+            return _Sample(0.0, 0.0, 0.0)
         first, last = self._samples[0], self._samples[-1]
-        manager_s, slots_s = last.manager_s - first.manager_s, last.slots_s - first.slots_s
-        return manager_s / (manager_s + slots_s) if slots_s > 0 else 0.0
+        return _Sample(*(after - before for before, after in zip(first, last, strict=True)))
 
 
 class ErrorCount(logging.Handler):

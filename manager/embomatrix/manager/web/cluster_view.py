@@ -24,6 +24,8 @@ PAGES_KEPT: Final = 64
 """Serialized pages of one snapshot that are cached."""
 FRESH_S: Final = 0.9
 """Pages ask once a second. All viewers within this time share one snapshot."""
+BUSY_CORE: Final = 0.8
+"""Share of its core above which the manager soon delays rollouts."""
 RECENT_S: Final = 300.0
 """Failures are reported in the health sentence for this long."""
 MANY_LOST: Final = 0.2
@@ -82,7 +84,11 @@ class Overview:
     store: str = ""
     """Problem of the state store; empty while it can be written."""
     overhead: float = 0.0
-    """Manager's share of the CPU time of manager and slots in the last minute."""
+    """Manager's share of the CPU time of manager and slots in the last minute; 0 if hardly anything ran."""
+    core_share: float = 0.0
+    """Share of one core that the manager used in the last minute."""
+    slots_at_work: float = 0.0
+    """Mean number of slots that executed plans in the last minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,6 +228,8 @@ def overview(runtime: ManagerRuntime) -> Overview:
         phases={phase.value: summary_of(found) for phase, found in runtime.event_log.phases().items()},
         store=runtime.store_problem,
         overhead=runtime.load.overhead(),
+        core_share=runtime.load.core_share(),
+        slots_at_work=runtime.load.slots_at_work(),
     )
 
 
@@ -365,6 +373,11 @@ def _health_of_work(seen: Overview, working: int, lost: int, now_s: float) -> He
         return Health(Mood.WARNING, f"{_workers(lost)} lost recently; all leases were re-dispatched.")
     if seen.queued and not seen.leased:
         return Health(Mood.WARNING, f"{seen.queued} rollouts are queued and none runs: no scene is warm yet.")
+    if seen.core_share > BUSY_CORE:
+        return Health(
+            Mood.WARNING,
+            f"The manager uses {seen.core_share:.0%} of its core: send larger batches, or give it a faster core.",
+        )
     if not seen.runs:
         waits = "waits" if working == 1 else "wait"
         return Health(Mood.IDLE, f"Ready: {_workers(working)} {waits} for a run.")

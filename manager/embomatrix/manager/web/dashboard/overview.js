@@ -4,7 +4,7 @@ import {at, count, h, none, put, seconds, share, signed, table} from "./dom.js";
 
 const TILES = [
   ["rate", "Throughput", "rollouts/s, 10\u00a0s mean"], ["p50", "Latency", ""], ["hits", "Prewarm hits", ""],
-  ["slots", "Slots busy", ""], ["overhead", "Overhead", "manager's share of CPU time"], ["bad", "Failures", ""],
+  ["slots", "Slots at work", ""], ["overhead", "Overhead", ""], ["bad", "Failures", ""],
 ];
 const PHASES = {queue: "waiting for a lease", lease: "network and waiting for a slot", load: "loading the scene", execute: "executing the plan", deliver: "writing the result"};
 let drawn = null;
@@ -30,9 +30,10 @@ export function show({overview: o, runs}) {
   const failed = Object.entries(o.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled").reduce((sum, [, n]) => sum + n, 0);
   const texts = {
     rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: o.latency_p95_s ? `median; 95th percentile ${seconds(o.latency_p95_s)}` : "from submission to result",
+    overheadnote: `manager's share of CPU time; ${share(o.core_share, 1)} of its core`,
     overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)}\u00a0%` : "–",
     hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: o.prewarm_hits ? `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted` : "of announced scenes",
-    slots: `${o.slots_busy}/${o.slots}`, slotsnote: `${count(o.queued)} rollouts queued`,
+    slots: `${o.slots_at_work.toFixed(1)}/${o.slots}`, slotsnote: `mean of a minute; ${count(o.queued)} rollouts queued`,
     bad: count(failed), badnote: `${count(o.redispatched)} re-dispatched, ${count(o.stale_results)} late`,
     peak: `peak ${count(Math.max(...o.throughput))}, ${count(o.outcomes.completed || 0)} in total`,
   };
