@@ -3,6 +3,7 @@
 The plan is a person's, the oracle's or a trained policy's.
 """
 
+import contextlib
 import os
 import sys
 from enum import StrEnum
@@ -14,6 +15,8 @@ from rich.console import Console
 from rich.markup import escape as without_markup
 from rich.table import Table
 
+from embomatrix.cli.play_by_hand import play_by_hand
+from embomatrix.envs.episode import Episode
 from embomatrix.factory.commands.terminal import counter, fail, user_errors
 from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
 from embomatrix.host.printable import printable
@@ -73,6 +76,9 @@ def play(
             "--show", help="Print the object table and the prompt that a model gets; execute nothing."
         ),
     ] = False,
+    interactive: Annotated[
+        bool, typer.Option("--interactive", help="Play by hand: type one call a line, and see what it does.")
+    ] = False,
     dataset: Annotated[
         Path | None,
         typer.Option(help=f"Folder of the dataset. Default: $EMBOMATRIX_DATASET, or {DEFAULT_DATASET}."),
@@ -95,8 +101,10 @@ def play(
             # Drawing takes minutes, so an unwritable path fails before anything is executed.
             check_suffix(film)
             check_writable(film)
-        if sum((bool(plan), oracle, policy is not None, show)) != 1:
-            fail("expected one of --plan FILE, --oracle, --policy FOLDER and --show: give one of them")
+        if sum((bool(plan), oracle, policy is not None, show, interactive)) != 1:
+            fail(
+                "expected one of --plan FILE, --oracle, --policy FOLDER, --interactive and --show: give one of them"
+            )
         root = dataset if dataset is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
         data = Dataset.load(root)
         record = data.find(task)
@@ -105,6 +113,9 @@ def play(
         _show_task(record.task)
         if show:
             _show_prompt(bundle, record.task)
+        elif interactive:
+            _show_prompt(bundle, record.task)
+            _play_by_hand(bundle, record.task, seed)
         else:
             found = _plan_of(bundle, record.task, text, policy, seed)
             _run(bundle, record.task, found, mode, seed, film)
@@ -125,6 +136,27 @@ def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: Path | None, 
         console.print(f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}")
         _show_reward(unparsable())
         raise typer.Exit(NO_PLAN) from None
+
+
+def _play_by_hand(bundle: Bundle, task: Task, seed: int) -> None:
+    """Let a person play the task call by call, and print the reward at the end."""
+
+    def read() -> str | None:
+        try:
+            return console.input("> ")
+        except EOFError:
+            return None
+
+    def show(text: str) -> None:
+        for line in text.splitlines():
+            console.print(escape(line))
+
+    with contextlib.closing(load_simulator(bundle)) as simulator:
+        episode = Episode(simulator, task, situation_of(bundle.scene, task))
+        episode.reset(seed)
+        reward = play_by_hand(episode, read, show, seed)
+    if reward is not None:
+        _show_reward(reward)
 
 
 def _plan_of_policy(folder: Path, situation: Situation, seed: int) -> Plan:

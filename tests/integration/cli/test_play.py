@@ -113,6 +113,19 @@ def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
     assert "Reward" not in printed
 
 
+def test_task_is_played_by_hand_call_by_call(run):
+    typed = "pick_up apple_1\ndance 3\nmove apple_1\nstate\npick_up 10\nmove countertop_1\nplace 0 ontop\nmove 1\n"
+    result = run("apple_to_counter", "--interactive", text=typed)
+    assert result.exit_code == 0, result.output
+    printed = " ".join(result.output.split())
+    assert "✗ apple_1 is" in printed, "a failed call changes nothing"
+    assert "unknown skill 'dance'" in printed
+    assert "✓ put apple_1 on top of countertop_1 the goal is reached" in printed
+    assert "Reward" in printed
+    assert "✓ stands at" not in printed.split("the goal is reached")[1], "the task ends at the goal"
+    assert "Reward" not in run("apple_to_counter", "--interactive", text="move 10\nrestart\n").output
+
+
 def test_newest_checkpoint_of_a_run_writes_the_plan(run, folder, tmp_path):
     tasks = load_tasks(folder)
     settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16})
@@ -138,11 +151,15 @@ def test_oracle_option_solves_the_task(run):
     ("arguments", "env", "words"),
     [
         (("cook_chiken", "--oracle"), {}, "there is no task 'cook_chiken'"),
-        (("cook_chicken",), {}, "expected one of --plan FILE, --oracle, --policy FOLDER and --show"),
+        (
+            ("cook_chicken",),
+            {},
+            "expected one of --plan FILE, --oracle, --policy FOLDER, --interactive and --show",
+        ),
         (
             ("cook_chicken", "--oracle", "--plan", "-"),
             {},
-            "expected one of --plan FILE, --oracle, --policy FOLDER and --show",
+            "expected one of --plan FILE, --oracle, --policy FOLDER, --interactive and --show",
         ),
         (("cook_chicken", "--plan", "/no/such/plan"), {}, "No such file or directory"),
         (
