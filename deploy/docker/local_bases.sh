@@ -7,6 +7,10 @@ set -euo pipefail
 # No manuals, translations or package lists, as in Debian's own images.
 LEFT_OUT=(usr/share/doc usr/share/man usr/share/info usr/share/locale usr/share/lintian var/cache var/lib/apt/lists var/log)
 
+# Say what is missing before the first minute is spent.
+needs() { printf 'local_bases.sh needs %s\n' "$1" >&2; exit 2; }
+docker info >/dev/null 2>&1 || needs 'a running Docker engine that this user may use: start it, for example with `systemctl start docker`'
+
 there() { docker image inspect "$1" >/dev/null 2>&1 || timeout "${PULL_LIMIT_S:-60}" docker pull --quiet "$1" >/dev/null 2>&1; }
 
 root=$(mktemp -d)
@@ -16,6 +20,8 @@ trap 'rm -rf "$root" "$root.log"' EXIT
 make() {
   local name=$1 packages=$2
   shift 2
+  [ "$(id -u)" = 0 ] || needs 'root, because debootstrap does: run it with sudo'
+  command -v debootstrap >/dev/null || needs 'debootstrap: apt-get install debootstrap'
   printf '%s: no registry has it, making it of Debian packages\n' "$name"
   debootstrap --variant=minbase --include="$packages" bookworm "$root" ${MIRROR:+"$MIRROR"} >"$root.log" 2>&1 ||
     { tail -5 "$root.log" >&2; exit 1; }

@@ -118,6 +118,8 @@ def init(
         print(f"made   {sentence}")
     for sentence in done.found:
         print(f"there  {sentence}")
+    option = f" --data-dir={folder}" if data_dir is not None else ""
+    print(f"next   embomatrix manager serve{option}, then `embomatrix doctor` on another machine")
 
 
 def _recipient(text: str) -> tuple[AccessRole, Path]:
