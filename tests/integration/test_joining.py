@@ -36,7 +36,7 @@ def test_init_files_are_private_and_never_overwritten(tmp_path):
     result = run("manager", "init", f"--data-dir={tmp_path}", "--san=lab.example", "--san=10.1.2.3")
     assert result.status == 0, result.text
     assert "lab.example" in result.text
-    assert f"next   embomatrix manager serve --data-dir={tmp_path}" in result.text
+    assert f"next embomatrix manager serve --data-dir={tmp_path}" in result.text
     files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in files}
     assert {name for name, mode in modes.items() if mode != 0o600} == {"ca.pem", "server.pem"}
