@@ -133,8 +133,14 @@ async def test_task_page_without_dataset_shows_the_option(browser, tmp_path):
     assert page.words["cards"] == "no dataset is shown: start the manager with --dataset FOLDER"
 
 
+async def test_unknown_page_says_so(browser, tmp_path):
+    async with manager(tmp_path / "data") as at:
+        page = await asyncio.to_thread(shown, browser, f"{at.status_url}#wrokers", tmp_path)
+    assert page.words["unknown"].startswith("There is no page “wrokers”: choose one of overview, workers,")
+
+
 def test_dashboard_asks_for_a_token(browser, tmp_path):
     with cluster(tmp_path / "cluster", "--token=the-secret") as (_, url):
         page = shown(browser, url, tmp_path)
-    assert page.words["link"] == "the token is missing or wrong"
+    assert page.words["link"] == "this manager asks for a token"
     assert "kitchen-worker" not in str(page.words)

@@ -92,6 +92,22 @@ async def _hear(client, words):
             await asyncio.sleep(0.05)
 
 
+async def test_misspelt_filter_is_refused_instead_of_showing_everything(tmp_path):
+    async with manager(tmp_path) as at, http_at(at) as http:
+        for path, words in (
+            (
+                "workers?sate=ready",
+                "/api/v1/workers has no parameter 'sate': expected limit, offset, search, state",
+            ),
+            ("overview?limit=1", "has no parameter 'limit': it has none"),
+            ("dispatch/pause?now=1", "has no parameter 'now'"),
+        ):
+            answer = await (http.post if "pause" in path else http.get)(f"/api/v1/{path}")
+            assert answer.status_code == 422
+            assert words in answer.json()["detail"]
+        assert (await http.get("/api/v1/workers?state=ready&limit=5")).status_code == 200
+
+
 async def test_completed_rollouts_of_a_lost_worker_stay_counted(tmp_path):
     async with (
         manager(tmp_path) as at,

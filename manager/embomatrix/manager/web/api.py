@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import TYPE_CHECKING, Final
 
-from fastapi import FastAPI, HTTPException, Response
+from fastapi import Depends, FastAPI, HTTPException, Response
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.middleware.gzip import GZipMiddleware
@@ -18,7 +18,13 @@ from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.web.cluster_view import Snapshots
 from embomatrix.manager.web.http_rules import STATIC, Guard, HttpRules
 from embomatrix.manager.web.prometheus import CONTENT_TYPE, metrics_page
-from embomatrix.manager.web.rest import PREFIX, answer_errors, command_routes, read_routes
+from embomatrix.manager.web.rest import (
+    PREFIX,
+    answer_errors,
+    command_routes,
+    only_known_parameters,
+    read_routes,
+)
 from embomatrix.manager.web.rest_tasks import task_routes
 from embomatrix.manager.web.rewards import reward_routes
 from embomatrix.rpc.versions import software_version
@@ -58,10 +64,14 @@ def build_api(
     app.add_middleware(Guard, rules=rules)
     app.mount(STATIC, _PageFiles(directory=DASHBOARD))
     snapshots = Snapshots(runtime)
-    app.include_router(read_routes(runtime, snapshots))
-    app.include_router(task_routes(gallery))
-    app.include_router(command_routes(runtime, snapshots, revocation))
-    app.include_router(reward_routes(runtime.runs))
+    strictly = [Depends(only_known_parameters)]
+    for routes in (
+        read_routes(runtime, snapshots),
+        task_routes(gallery),
+        command_routes(runtime, snapshots, revocation),
+        reward_routes(runtime.runs),
+    ):
+        app.include_router(routes, dependencies=strictly)
 
     @app.get("/", include_in_schema=False)
     async def index() -> FileResponse:

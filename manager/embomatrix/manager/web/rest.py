@@ -71,6 +71,15 @@ Reason = Annotated[
 ]
 
 
+def only_known_parameters(request: Request) -> None:
+    """Refuse query parameters that the route does not have: a misspelt filter would show everything."""
+    known = sorted({parameter.alias for parameter in request.scope["route"].dependant.query_params})
+    for name in request.query_params:
+        if name not in known:
+            expected = f"expected {', '.join(known)}" if known else "it has none"
+            raise InvalidRequestError(f"{request.url.path} has no parameter {name[:64]!r}: {expected}")
+
+
 def read_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
     """Return the routes of viewers."""
     router = APIRouter(prefix=PREFIX, tags=["look"])

@@ -1,6 +1,6 @@
 // Dashboard: one snapshot a second feeds the page that is open.
 import {ask} from "./ask.js";
-import {at, clock, seconds} from "./dom.js";
+import {at, clock, h, seconds} from "./dom.js";
 import {learn} from "./names.js";
 
 // The code of a page is loaded when it is opened, together with the first snapshot.
@@ -16,13 +16,13 @@ let waiting = 0;
 let opened = 0;
 
 async function open() {
-  const asked = location.hash.slice(1).split("?")[0], name = Object.hasOwn(PAGES, asked) ? asked : "overview", turn = ++opened;
+  const asked = location.hash.slice(1).split("?")[0], name = asked || "overview", turn = ++opened;
   clearTimeout(waiting);
   const first = ask(`snapshot?${new URLSearchParams({limit: ROWS[name] ?? 1})}`);
   first.catch(() => {}); // the next refresh repeats the request
   let code;
   try {
-    code = await PAGES[name]();
+    code = Object.hasOwn(PAGES, name) ? await PAGES[name]() : unknown(name);
   } catch {
     at("dot").className = "dot lost";
     showStatus("a part of the dashboard failed to load: reload the page");
@@ -40,6 +40,12 @@ async function open() {
   await refresh(page.asksMore?.() ? null : first);
   // Load the other pages in the background, so that they open at once, even while the manager is away.
   setTimeout(() => Promise.allSettled(Object.values(PAGES).map(load => load())), REFRESH_MS);
+}
+
+/** Page for a name that is none. */
+function unknown(name) {
+  const words = `There is no page “${name}”: choose one of ${Object.keys(PAGES).join(", ")}.`;
+  return {open: main => main.replaceChildren(h("section", {class: "most"}, h("p", {class: "none", id: "unknown"}, words))), show: () => {}};
 }
 
 /** Request a snapshot and show it; `first` is a request already under way. */

@@ -21,7 +21,7 @@ async function answer(path, options = {}) {
   const response = await fetch(`/api/v1/${path}`, {cache: "no-store", headers, signal: AbortSignal.timeout(5000), ...options});
   if (response.status === 401) {
     document.getElementById("ask").hidden = false;
-    throw new Refused("the token is missing or wrong");
+    throw new Refused(token ? "this token is unknown, expired or revoked: enter another" : "this manager asks for a token");
   }
   if (!response.ok) {
     const text = await response.text();
