@@ -8,13 +8,13 @@ pytestmark = [pytest.mark.peers, pytest.mark.timeout(900)]
 CHECK = """
 import gymnasium, sys, warnings
 from gymnasium.utils.env_checker import check_env
-from embomatrix.envs.gym import HouseholdEnv, SKILLS, action_of, call_of
+from embomatrix.envs.gym import ENV_ID, HouseholdEnv, action_of, call_of
 from embomatrix.skills.syntax import SkillCall, Skill
 warnings.simplefilter("error")
-gymnasium.register("EmboMatrix/Household-v0", entry_point="embomatrix.envs.gym:HouseholdEnv")
 options = dict(dataset=sys.argv[1], render_mode="ansi", disable_env_checker=True)
 env = gymnasium.make("EmboMatrix/Household-v0", **options).unwrapped
 check_env(env)
+check_env(gymnasium.make(ENV_ID, text_actions=True, **options).unwrapped)
 first = [env.reset(seed=5)[0], env.reset(seed=5)[0]]
 assert first[0] == first[1]
 env.action_space.seed(0)
@@ -22,6 +22,30 @@ for _ in range(200):
     call = call_of(env.action_space.sample(), ("kitchen_0",))
     if call.room_name in (None, "kitchen_0"):
         assert call_of(action_of(call, ("kitchen_0",)), ("kitchen_0",)) == call
+_, info = env.reset(seed=1, options={"task_id": "apple_to_counter"})
+for _ in range(20):
+    sampled = env.action_space.sample(mask=info["action_mask"])
+    assert int(sampled["object"]) < len(info["objects"])
+_, gain, over, cut, step = env.step("dance")
+assert (gain, over, cut, step) == (-1.0, False, False, {"failure": "unparsable"})
+total = 0.0
+for call in ("move 10", "pick_up 10", "move 0", "place 0 ontop"):
+    observation, gain, over, cut, step = env.step(call)
+    total += gain
+assert over and step["success"], observation["message"]
+assert "2 calls: expected one" in env.step("move 10\\nmove 0")[0]["message"]
+wrongs = (({"skill": 0}, "the action lacks distance"), (3, "the action is int"), ({**sampled, "skill": 99}, "skill 99"))
+for wrong, words in wrongs:
+    try:
+        env.step(wrong)
+    except ValueError as error:
+        assert words in str(error), error
+    else:
+        raise AssertionError(wrong)
+try:
+    HouseholdEnv(sys.argv[1], render_mode="rgb_array")
+except ValueError as error:
+    assert "expected ansi" in str(error)
 try:
     env.reset(options={"task_id": "elsewhere"})
 except ValueError as error:

@@ -70,6 +70,11 @@ class Episode:
         gain, self._total = reward.total - self._total, reward.total
         return EpisodeStep(step, reward, gain, over=self._calls >= MAX_STEPS)
 
+    def skip(self) -> bool:
+        """Count a call that could not be understood, and return whether the plan has reached its maximum length."""
+        self._calls += 1
+        return self._calls >= MAX_STEPS
+
     def prompt(self, codec: Codec = Codec.JSON) -> Prompt:
         """Prompt of the task for a language model."""
         return prompt_for(self.situation, codec)

@@ -1,6 +1,7 @@
 """Gymnasium environment: an action is one skill call, an observation is text, and an episode's rewards add up to its plan's.
 
-Needs ``gymnasium``, which no other module needs.
+Needs ``gymnasium``, which no other module needs. The import registers ``ENV_ID``, so after it
+``gymnasium.make("EmboMatrix/Household-v0", dataset="build/dataset")`` works.
 """
 
 import math
@@ -8,21 +9,32 @@ import string
 from pathlib import Path
 from typing import Any, Final, SupportsFloat
 
-import gymnasium
 import numpy as np
-from gymnasium import spaces
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"embomatrix.envs.gym needs the package {error.name}: pip install 'gymnasium>=1.1'", name=error.name
+    ) from None
 
 from embomatrix.envs.episode import Episode, EpisodeStep, Household
+from embomatrix.reward.hierarchy import unparsable
 from embomatrix.skills.limits import ROBOT
+from embomatrix.skills.parse import PlanError, PlanReason, parse_plan
 from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, SkillCall
 from embomatrix.world.dataset import SPLITS, DatasetError
 from embomatrix.world.task import MAX_TABLE, Profile
 
+ENV_ID: Final = "EmboMatrix/Household-v0"
+RENDER_MODES: Final = ("ansi",)
 SKILLS: Final = PROFILES[Profile.HOUSEHOLD]
 RELATIONS: Final = tuple(PlaceRelation)
 MOST_ROOMS: Final = 32
 CHARACTERS: Final = string.printable
 LONGEST_TEXT: Final = 32_768
+LONGEST_ACTION: Final = 256
 
 
 class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
@@ -30,7 +42,10 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     *Action*, a dict: ``skill`` (in the order of ``SKILLS``), ``object`` and ``source`` (rows of the object table),
     ``relation`` (in the order of ``RELATIONS``), ``room`` (in the order of ``info["rooms"]``), ``yaw`` (rad), ``distance``
-    (m). Arguments that the skill does not take are ignored.
+    (m). Arguments that the skill does not take are ignored. Or a text with one call, such as ``"move 3"``; with
+    ``text_actions`` the action space is of such texts. Text without exactly one call changes nothing, gains −1 and has the
+    failure ``unparsable``. ``info["action_mask"]`` marks skills, rows and rooms that exist in the task, as
+    ``action_space.sample(mask=…)`` takes it; a call with them may still fail.
 
     *Observation*, a dict of texts: ``task`` (the prompt, constant), ``state`` (one line per object), ``message`` (the outcome
     of the last call).
@@ -39,11 +54,20 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     nothing.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["ansi"], "render_fps": 1}  # noqa: RUF012  # declared so by gymnasium
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 1}  # noqa: RUF012  # declared so by gymnasium
 
-    def __init__(self, dataset: str | Path, split: str = "train", render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        dataset: str | Path,
+        split: str = "train",
+        render_mode: str | None = None,
+        *,
+        text_actions: bool = False,
+    ) -> None:
         if split not in SPLITS:
             raise ValueError(f"a dataset has no split {split!r}: expected {' or '.join(SPLITS)}")
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode {render_mode!r}: expected {' or '.join(RENDER_MODES)}, or None")
         self.render_mode = render_mode
         self._household = Household(dataset)
         self._task_ids = [record.task.task_id for record in self._household.records if record.split == split]
@@ -51,7 +75,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             raise DatasetError(f"the dataset at {dataset} has no task of the split {split!r}: pass another")
         self._episode: Episode | None = None
         self._message = ""
-        self.action_space = spaces.Dict(
+        self._calls = spaces.Dict(
             {
                 "skill": spaces.Discrete(len(SKILLS)),
                 "object": spaces.Discrete(MAX_TABLE),
@@ -61,6 +85,9 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
                 "yaw": spaces.Box(-math.pi, math.pi, (), np.float64),
                 "distance": spaces.Box(0.0, ROBOT.max_step_m, (), np.float64),
             }
+        )
+        self.action_space: spaces.Space[Any] = (
+            spaces.Text(LONGEST_ACTION, min_length=0, charset=CHARACTERS) if text_actions else self._calls
         )
         text = spaces.Text(LONGEST_TEXT, min_length=0, charset=CHARACTERS)
         self.observation_space = spaces.Dict({"task": text, "state": text, "message": text})
@@ -78,24 +105,55 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             "task_id": self._episode.task.task_id,
             "rooms": self._episode.situation.rooms,
             "objects": self._episode.task.table,
+            "action_mask": mask_of(self._episode),
         }
 
     def step(
-        self, action: dict[str, Any]
+        self, action: dict[str, Any] | str
     ) -> tuple[dict[str, Any], SupportsFloat, bool, bool, dict[str, Any]]:
-        """Execute one call. ``info`` has the reward's tiers, success, and the reason of a failed call."""
-        if self._episode is None:
+        """Execute one call. ``info`` has the reward's tiers, success, and the reason of a failed call.
+
+        Raises ValueError for a dict that is no action.
+        """
+        episode = self._episode
+        if episode is None:
             raise RuntimeError("no episode was begun: call reset() first")
-        outcome = self._episode.act(call_of(action, self._episode.situation.rooms))
+        try:
+            call = self._call(action, episode)
+        except PlanError as error:
+            self._message = str(error)
+            over = episode.skip()
+            return self._observed(episode), unparsable().total, False, over, {"failure": "unparsable"}
+        outcome = episode.act(call)
         self._message = outcome.step.message
         success = outcome.reward.success
         return (
-            self._observed(self._episode),
+            self._observed(episode),
             outcome.gain,
             success,
             outcome.over and not success,
             step_info(outcome),
         )
+
+    def _call(self, action: dict[str, Any] | str, episode: Episode) -> SkillCall:
+        """Return the call of an action. Raises PlanError for a text, ValueError for a dict."""
+        if isinstance(action, str):
+            plan = parse_plan(action, episode.task.profile)
+            if len(plan) != 1:
+                raise PlanError(PlanReason.TOO_MANY_STEPS, f"{len(plan)} calls: expected one for each step")
+            return plan[0]
+        missing = sorted(self._calls.spaces.keys() - action.keys()) if isinstance(action, dict) else []
+        if missing or not isinstance(action, dict):
+            lacks = f"lacks {', '.join(missing)}" if missing else f"is {type(action).__name__}"
+            raise ValueError(
+                f"the action {lacks}: expected a dict with {', '.join(self._calls.spaces)}, or a text with one call"
+            )
+        if not 0 <= int(action["skill"]) < len(SKILLS) or not 0 <= int(action["relation"]) < len(RELATIONS):
+            raise ValueError(
+                f"skill {action['skill']} or relation {action['relation']} is out of range: expected less than "
+                f"{len(SKILLS)} and {len(RELATIONS)}"
+            )
+        return call_of(action, episode.situation.rooms)
 
     def render(self) -> str | None:
         """State in words, with ``render_mode="ansi"``."""
@@ -114,6 +172,23 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             "message": self._message,
         }
         return {name: _plain(text) for name, text in texts.items()}
+
+
+def mask_of(episode: Episode) -> dict[str, Any]:
+    """Mask of the action space: skills of the task's profile, rows of its table and rooms of its scene."""
+    rows = (np.arange(MAX_TABLE) < len(episode.task.table)).astype(np.int8)
+    skills = np.array([skill in PROFILES[episode.task.profile] for skill in SKILLS], dtype=np.int8)
+    rooms = (np.arange(MOST_ROOMS) < len(episode.situation.rooms)).astype(np.int8)
+    everything = np.ones(len(RELATIONS), dtype=np.int8)
+    return {
+        "skill": skills,
+        "object": rows,
+        "source": rows,
+        "relation": everything,
+        "room": rooms,
+        "yaw": None,
+        "distance": None,
+    }
 
 
 def call_of(action: dict[str, Any], rooms: tuple[str, ...]) -> SkillCall:
@@ -157,3 +232,7 @@ def step_info(outcome: EpisodeStep) -> dict[str, Any]:
 def _plain(text: str) -> str:
     """Restrict text to the characters and the length of the observation space."""
     return "".join(letter if letter in CHARACTERS else "?" for letter in text[:LONGEST_TEXT])
+
+
+if ENV_ID not in gymnasium.registry:
+    gymnasium.register(ENV_ID, entry_point="embomatrix.envs.gym:HouseholdEnv")
