@@ -85,6 +85,9 @@ class HumanFormatter(logging.Formatter):
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(levelname)-7s %(message)s")
+        # Lines of several machines are read together: UTC.
+        self.converter = time.gmtime
+        self.default_msec_format = "%s.%03dZ"
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # the standard library's name
         named = set(_fields(record))

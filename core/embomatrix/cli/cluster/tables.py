@@ -114,7 +114,7 @@ def plan_table(cells: Sequence[PlanCell]) -> Table:
 
 def event_line(event: RunEvent) -> Text:
     """Format an event as one line: time, kind, and fields as ``name=value``."""
-    at = time.strftime("%H:%M:%S", time.localtime(event.at_s)) + f".{int(event.at_s % 1 * 1000):03d}"
+    at = time.strftime("%H:%M:%S", time.gmtime(event.at_s)) + f".{int(event.at_s % 1 * 1000):03d}"
     named = (
         ("batch", event.batch_id),
         ("rollout", event.rollout_id),
@@ -135,7 +135,7 @@ def event_line(event: RunEvent) -> Text:
 
 def step_line(step: RolloutStep, begin_s: float) -> Text:
     """Format a step of a rollout's history as one line, with seconds since the first step."""
-    at = time.strftime("%H:%M:%S", time.localtime(step.at_s))
+    at = time.strftime("%H:%M:%S", time.gmtime(step.at_s))
     line = Text(f"{at} +{step.at_s - begin_s:.3f} s ", style="dim", no_wrap=True)
     line.append(printable(f"{step.kind:<10}"), style="default")
     line.append(printable(f" {step.worker_id}:") if step.worker_id else "", style="default")

@@ -29,8 +29,8 @@ export const share = (part, all) => all ? unit(Math.round(100 * part / all), "%"
 export const counted = (number, noun) => `${count(number)} ${noun}${number === 1 ? "" : "s"}`;
 /** Time of day; with the date unless it is today. */
 export function clock(seconds) {
-  const moment = new Date(seconds * 1000), today = moment.toDateString() === new Date().toDateString();
-  return today ? moment.toLocaleTimeString() : moment.toLocaleString([], {month: "short", day: "numeric", hour: "2-digit", minute: "2-digit"});
+  const [day, time] = new Date(seconds * 1000).toISOString().split("T"), [today] = new Date().toISOString().split("T");
+  return day === today ? `${time.slice(0, 8)} UTC` : `${day} ${time.slice(0, 5)} UTC`;
 }
 /** Text with a minus sign instead of a hyphen. */
 export const signed = text => String(text).replace("-", "\u2212");
