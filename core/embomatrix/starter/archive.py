@@ -61,10 +61,7 @@ RECIPE: Final = Recipe(
         "restaurant_diner",
     ),
 )
-"""Fourteen scenes; two of the ten homes are held out.
-
-The dataset that ships now is older, the first part of such a build.
-"""
+"""Fourteen scenes; two of the ten homes are held out."""
 
 
 def content_digest(dataset: Dataset) -> str:

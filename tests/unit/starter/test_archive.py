@@ -8,7 +8,7 @@ import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 
 from embomatrix.starter import archive
-from embomatrix.starter.archive import content_digest, pack, unpack
+from embomatrix.starter.archive import RECIPE, content_digest, pack, unpack
 from embomatrix.world.dataset import Dataset, DatasetError
 
 
@@ -60,12 +60,13 @@ def test_damaged_file_is_reported_and_writes_nothing(tmp_path: Path, kitchen: Da
 def test_the_package_ships_proved_tasks_in_many_scenes(tmp_path: Path) -> None:
     unpack(tmp_path)
     shipped = Dataset.load(tmp_path)
-    assert (len(shipped.train), len(shipped.heldout)) == (317, 120)
+    assert (len(shipped.train), len(shipped.heldout)) == (RECIPE.train, RECIPE.heldout)
     scenes = {
         split: {record.task.scene_id.partition("-")[0] for record in records}
         for split, records in (("train", shipped.train), ("heldout", shipped.heldout))
     }
     assert not scenes["train"] & scenes["heldout"]
     assert len(scenes["train"]) >= 10
+    assert all(record.difficulty is not None for record in shipped.records)
     for record in shipped.records[::10]:
         assert record.task.task_id in shipped.read_bundle(record.bundle_digest).tasks
