@@ -26,15 +26,17 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     "scripts": (
         "Success of scripts",
-        "`embomatrix factory evaluate scripts --dataset DATASET` executes the plans of scripts on the held-out tasks. "
-        "*template* knows all phrases of the training split, *nearest* copies the demands of the most similar training "
-        "instruction, *greedy* knows the goal. A small share means that the words need more than a table of phrases.",
+        "`embomatrix factory evaluate scripts` executes the plans of scripts on the held-out tasks of the shipped dataset, or "
+        "of another `--dataset`. *template* knows all phrases of the training split, *nearest* copies the demands of the most "
+        "similar training instruction, *greedy* knows the goal. A small share means that the words need more than a table of "
+        "phrases.",
     ),
     "readings": (
         "Readers",
-        "`embomatrix factory evaluate readings --dataset DATASET --answers FILE` judges answers of readers who saw prompts "
-        "only. *human_success* is the share of their plans that succeed, *instruction_goal_agreement* the share of goals that "
-        "equal the task's or are equivalent by execution. The packaged answers are by large language models, none by people.",
+        "`embomatrix factory evaluate readings` judges answers of readers who saw prompts of held-out tasks only: the packaged "
+        "ones to the shipped dataset, or `--answers FILE` to another `--dataset`. *human_success* is the share of their plans "
+        "that succeed, *instruction_goal_agreement* the share of goals that equal the task's or are equivalent by execution. "
+        "The packaged answers are by four large language models, none by people.",
     ),
     "admission": (
         "Admission",

@@ -138,7 +138,7 @@ def evaluation_of(results: ScriptResults, conditions: Mapping[str, str | int]) -
         held = [result[name] for result in results.values()]
         share = sum(held) / len(held)
         figure_name = f"{name}_success"
-        figures.append(Figure(figure_name, share, "share", Better.LOWER, len(held), GOALS.get(name)))
+        figures.append(Figure(figure_name, share, "", Better.LOWER, len(held), GOALS.get(name)))
         interval = wilson(share, len(held))
         notes.append(f"{figure_name} {share:.3f} [{interval.low:.3f}, {interval.high:.3f}]")
     note = f"With 95 % Wilson intervals over tasks: {', '.join(notes)}."
