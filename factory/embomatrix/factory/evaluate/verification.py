@@ -31,7 +31,7 @@ from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 SUCCESS: Final = ""
 """Empty sentence of a task without an objection."""
 GOAL_PERCENT: Final = 100.0
-PHYSICAL_GOAL_PERCENT: Final = 97.0
+PHYSICAL_GOAL_PERCENT: Final = 98.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -276,7 +276,9 @@ def _show_summary(summary: TrainingSummary) -> None:
 
     console = Console(markup=False)
     title = "held-out success, 95 % intervals"
-    table = Table("tasks", "", "before GRPO", "after GRPO", "difference", title=title, title_justify="left")
+    table = Table(
+        "category", "tasks", "before GRPO", "after GRPO", "difference", title=title, title_justify="left"
+    )
     for row in success_rows(summary):
         table.add_row(*row)
     if table.rows:

@@ -21,7 +21,15 @@ def success_curve(points: Sequence[tuple[int, Interval]]) -> str:
         figure, axes = new_chart("held-out success")
         low, high = ([getattr(found, side) for _, found in points] for side in ("low", "high"))
         axes.fill_between(steps, low, high, color=GOOD, alpha=0.18, linewidth=0)
-        axes.plot(steps, [found.value for _, found in points], "o-", color=GOOD, linewidth=1.8, markersize=4)
+        axes.plot(
+            steps,
+            [found.value for _, found in points],
+            "o-",
+            color=GOOD,
+            linewidth=1.8,
+            markersize=4,
+            clip_on=False,
+        )
         axes.set_ylim(bottom=0)
         _as_shares(axes)
         _steps(axes, max(steps))

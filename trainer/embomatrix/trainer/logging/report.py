@@ -39,7 +39,7 @@ _CURVES: Final = (
     ("success", "success of training rollouts", True),
     ("plan_steps", "executed steps per plan", False),
     ("entropy", "entropy of a token (nats)", False),
-    ("kl", "KL to the policy after imitation (nats)", False),
+    ("kl", "KL to the imitated policy (nats)", False),
     ("zero_variance_groups", "groups without a signal", True),
 )
 """Figures of a step: name, label, and whether it is a share."""
@@ -164,7 +164,9 @@ def _story(summary: TrainingSummary) -> str:
     """Table of success by category, and what the run consisted of in a sentence."""
     outcome, stats = summary.outcome, summary.stats
     rows = success_rows(summary)
-    table = html_table([("tasks", "", "before GRPO", "after GRPO", "difference"), *rows]) if rows else ""
+    table = (
+        html_table([("category", "tasks", "before GRPO", "after GRPO", "difference"), *rows]) if rows else ""
+    )
     return (
         f"{table or '<p>The dataset has no held-out tasks.</p>'}"
         f"<p>{outcome.imitation_steps:,} steps of imitation, then {outcome.steps:,} of GRPO with "
@@ -186,7 +188,7 @@ def _held_out_curve(evaluations: Sequence[RecordedEvaluation]) -> str:
     """Curve of held-out success, empty for fewer than three evaluations: two are in the table."""
     points = [(each.step, _success(each)) for each in evaluations if each.answers]
     return (
-        f"<section><h2>Held-out success during GRPO</h2>{success_curve(points)}</section>"
+        f"<section class='curve'><h2>Held-out success during GRPO</h2>{success_curve(points)}</section>"
         if len(points) > 2
         else ""
     )
