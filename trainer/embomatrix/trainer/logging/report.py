@@ -143,7 +143,7 @@ def machine_description() -> str:
 
 
 def _about(summary: TrainingSummary, source: TrainedOn) -> str:
-    """When, how long, on what and with what the run trained, in one line."""
+    """Return date, length, seed, dataset, version and machine of the run in one line."""
     outcome, tasks = summary.outcome, source.tasks
     minutes, seconds = divmod(round(outcome.wall_s), 60)
     dataset = f"{tasks.folder}, " if tasks.folder is not None else ""
