@@ -193,7 +193,7 @@ def test_missing_package_error_names_the_extra(kitchen, tmp_path, package, argum
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("play", TASK, "--dataset=x"), "expected either --plan FILE or --oracle"),
+        (("play", TASK, "--dataset=x"), "expected one of --plan FILE, --oracle, --policy FOLDER"),
         (("factory", "import"), "found 0 sources: expected exactly one of --bddl FILE"),
         (("train", "--minutes=-1"), "Invalid value for '--minutes'"),
         (("demo", "--workers=0"), "Invalid value for '--workers'"),

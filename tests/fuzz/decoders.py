@@ -117,6 +117,7 @@ OWN: Final[Mapping[str, str]] = {
     "manager.services.rollout:RolloutServicer._results": WRITTEN,
     "manager.web.rewards:_read": WRITTEN,
     "sim.fidelity.plans:_Writer.__init__": WRITTEN,
+    "trainer.logging.evaluations:_rows": WRITTEN,
     "trainer.logging.recorder:read_metrics": WRITTEN,
     "worker.host.settings:WorkerSettings": WRITTEN,
     "world.tables:TableWriter.arrays": WRITTEN,

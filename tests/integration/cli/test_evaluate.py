@@ -38,7 +38,7 @@ def run_evaluation(*arguments):
     [
         (
             ("--model=OUT", "--bench=DATASET"),
-            "OUT is not a model: expected runs/NAME/checkpoints/step-000050",
+            "OUT is not a model: expected runs/NAME, one of its checkpoints",
         ),
         (("--bench=DATASET",), "expected one of --model, --endpoint, --baseline and --answers"),
         (

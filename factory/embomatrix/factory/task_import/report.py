@@ -18,7 +18,7 @@ from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.task import Profile
 
 FIGURES: Final[Mapping[str, tuple[str, float]]] = {
-    "embomatrix": ("import_rate_sample", 0.97),
+    "embomatrix": ("import_rate_sample", 0.98),
     BEHAVIOR: ("import_rate_behavior", 0.6),
     EAI: ("import_rate_eai", 1.0),
 }

@@ -19,7 +19,6 @@ from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings, g
 from embomatrix.rpc.status import ClusterError, InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca, read_token
 from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
-from embomatrix.world.dataset import Dataset, DatasetError
 
 if TYPE_CHECKING:
     from embomatrix.rpc.admin_client import AdminClient
@@ -75,6 +74,9 @@ def _check_dataset(folder: Path | None) -> None:
     """Refuse a dataset that can't be shown, before anything is served."""
     if folder is None:
         return
+    # The image of a manager without a dataset has no numpy, which bundles need.
+    from embomatrix.world.dataset import Dataset, DatasetError
+
     try:
         Dataset.load(folder)
     except DatasetError as error:
