@@ -15,7 +15,7 @@ from embomatrix.factory.evaluate.readings import prompts_of
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows, is_card_of
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.host.printable import printable
-from embomatrix.world.dataset import Dataset, TaskRecord
+from embomatrix.world.dataset import SPLITS, Dataset, TaskRecord
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
 
@@ -34,8 +34,8 @@ def list_(
 ) -> None:
     """List the tasks of a dataset, page by page."""
     with user_errors():
-        if split not in ("", "train", "heldout"):
-            fail(f"--split {split!r}: expected train or heldout")
+        if split not in ("", *SPLITS):
+            fail(f"--split {split!r}: expected {' or '.join(SPLITS)}")
         records = Dataset.load(folder).records
     found = list(_selected(records, split, scene, category, search))
     if as_json:

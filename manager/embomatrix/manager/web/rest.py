@@ -71,8 +71,11 @@ Reason = Annotated[
 ]
 
 
-def only_known_parameters(request: Request) -> None:
-    """Refuse query parameters that the route does not have: a misspelt filter would show everything."""
+async def only_known_parameters(request: Request) -> None:
+    """Refuse query parameters that the route does not have: a misspelt filter would show everything.
+
+    A coroutine, because FastAPI would run a function in a thread, for every reward too.
+    """
     known = sorted({parameter.alias for parameter in request.scope["route"].dependant.query_params})
     for name in request.query_params:
         if name not in known:

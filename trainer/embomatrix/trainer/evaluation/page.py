@@ -33,7 +33,7 @@ def evaluation_page(
     tasks = [_task_row(task) for task in report["verdicts"]]
     return string.Template(template).substitute(
         head=page_head(f"{title} · EmboMatrix evaluation"),
-        plan_style=plan_style(),
+        page_style=page_style(),
         title=html.escape(title),
         about=html.escape(about(report)),
         scores="".join(map(_section, score_tables(report, beside))),
@@ -64,9 +64,9 @@ def _task_row(task: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def plan_style() -> str:
-    """Return the CSS of ``picture_section``."""
-    return files("embomatrix.trainer.evaluation").joinpath("plan.css").read_text(encoding="utf-8")
+def page_style() -> str:
+    """Return the CSS of a page with ``picture_section``: its frame, and the plan views."""
+    return files("embomatrix.trainer.evaluation").joinpath("page.css").read_text(encoding="utf-8")
 
 
 def picture_section(picture: Picture, title: str) -> str:

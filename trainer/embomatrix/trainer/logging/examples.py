@@ -21,7 +21,6 @@ LEARNED: Final = "learned"
 LOST: Final = "lost"
 KEPT: Final = "succeeds before and after"
 FAILS: Final = "fails before and after"
-MOST: Final = 3
 
 Answers = Mapping[str, Sequence[HeldOutAnswer]]
 
@@ -49,7 +48,7 @@ def examples_of(before: RecordedEvaluation, after: RecordedEvaluation, tasks: Ta
         with contextlib.suppress(BundleError, DatasetError):
             scene = decode_bundle(tasks.bundle_bytes(task.bundle_digest)).scene
             found[kind] = Example(change, _picture(scene, task, first), _picture(scene, task, second))
-    return tuple(found.values())[:MOST]
+    return tuple(found.values())
 
 
 def _candidates(earlier: Answers, later: Answers) -> Iterator[tuple[str, str, HeldOutAnswer, HeldOutAnswer]]:
@@ -73,13 +72,14 @@ def _candidates(earlier: Answers, later: Answers) -> Iterator[tuple[str, str, He
 
 def _with(answers: Sequence[HeldOutAnswer], success: bool) -> HeldOutAnswer | None:
     """Return the first executed plan that succeeded or failed."""
-    fitting = (each for each in answers if each.plan and each.verdict.success is success)
-    return next((each for each in fitting if not each.verdict.lost), None)
+    return next((each for each in answers if each.plan and each.verdict.success is success), None)
 
 
 def _by_task(evaluation: RecordedEvaluation) -> dict[str, list[HeldOutAnswer]]:
     found: dict[str, list[HeldOutAnswer]] = {}
     for answer in evaluation.answers:
+        if answer.verdict.lost:
+            continue
         found.setdefault(answer.verdict.task_id, []).append(answer)
     return found
 

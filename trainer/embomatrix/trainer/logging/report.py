@@ -16,12 +16,10 @@ import torch
 
 from embomatrix.host.code_version import commit_here
 from embomatrix.host.limits import usable_cores
-from embomatrix.pages.figures import Interval
 from embomatrix.pages.head import html_table, page_head
 from embomatrix.rpc.wire.values import RunStats
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, improvement
-from embomatrix.trainer.evaluation.intervals import mean_over_tasks
-from embomatrix.trainer.evaluation.page import picture_section, plan_style
+from embomatrix.trainer.evaluation.page import page_style, picture_section
 from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
 from embomatrix.trainer.logging.curves import step_curve, success_curve
 from embomatrix.trainer.logging.evaluations import AFTER, BEFORE, RecordedEvaluation
@@ -123,11 +121,11 @@ def write_report(
     title = f"Training of {summary.outcome.model}"
     page = string.Template(template).substitute(
         head=page_head(title),
-        plan_style=plan_style(),
+        page_style=page_style(),
         title=html.escape(title),
         about=html.escape(_about(summary, source)),
         story=_story(summary),
-        curve=_held_out_curve(evaluations),
+        curve=_held_out_curve(evaluations, source.tasks),
         causes=_causes(before, after, source.tasks),
         examples=_examples(before, after, source.tasks),
         curves="".join(map(_section_of_curve, _drawn(metrics))),
@@ -184,22 +182,15 @@ def _categories(tasks: TaskSet) -> dict[str, TaskCategory]:
     return {task.task.task_id: task.task.category for task in tasks.heldout}
 
 
-def _held_out_curve(evaluations: Sequence[RecordedEvaluation]) -> str:
+def _held_out_curve(evaluations: Sequence[RecordedEvaluation], tasks: TaskSet) -> str:
     """Curve of held-out success, empty for fewer than three evaluations: two are in the table."""
-    points = [(each.step, _success(each)) for each in evaluations if each.answers]
+    categories = _categories(tasks)
+    points = [(each.step, each.board(categories).success().interval) for each in evaluations if each.answers]
     return (
         f"<section class='curve'><h2>Held-out success during GRPO</h2>{success_curve(points)}</section>"
         if len(points) > 2
         else ""
     )
-
-
-def _success(evaluation: RecordedEvaluation) -> Interval:
-    by_task: dict[str, list[bool]] = {}
-    for answer in evaluation.answers:
-        if not answer.verdict.lost:
-            by_task.setdefault(answer.verdict.task_id, []).append(answer.verdict.success)
-    return mean_over_tasks([sum(found) / len(found) for found in by_task.values()]).interval
 
 
 def _causes(before: RecordedEvaluation | None, after: RecordedEvaluation | None, tasks: TaskSet) -> str:
@@ -269,7 +260,7 @@ def _next_steps(summary: TrainingSummary, source: TrainedOn) -> str:
     dataset = source.tasks.folder or "DATASET"
     commands = (
         (
-            f"embomatrix eval --bench {dataset} --model {summary.checkpoint / 'policy'}",
+            f"embomatrix eval --bench {dataset} --model {summary.report.parent}",
             "scores it on the held-out tasks",
         ),
         (
