@@ -1,22 +1,27 @@
 """Checks of a scene before physics loads it: Bullet silently accepts NaN, unknown ids and a 17th part."""
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 from embomatrix.sim.engine import BACKGROUND, FLOOR, WALL, EngineError
+from embomatrix.sim.geometry.bounds import ASSETS_KEPT
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.codec import asset_from_json, asset_to_json
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import ConvexPart, Pose
 from embomatrix.world.records import MAX_COORDINATE_M, UNIT_TOLERANCE, SceneInvalidError
 from embomatrix.world.scene import Scene, SceneObject
+
+WALLS_KEPT: Final = 1024
 
 
 def check_scene(scene: Scene) -> None:
     """Raise EngineError for the first element of the scene that physics can't take."""
     seen = {WALL, FLOOR, BACKGROUND}
     for wall in scene.walls:
-        check_asset(Asset("wall", "wall", "", wall.size_m, 1.0, (Link("base", (wall,)),)))
+        _check_wall(wall)
     for item in scene.objects:
         if item.name in seen:
             raise EngineError(f"two bodies are called {item.name!r}: expected unique names; rename one")
@@ -41,12 +46,29 @@ def check_scene(scene: Scene) -> None:
         check_asset(scene.assets[asset_id])
 
 
+@functools.lru_cache(maxsize=WALLS_KEPT)
+def _check_wall(wall: ConvexPart) -> None:
+    check_asset(Asset("wall", "wall", "", wall.size_m, 1.0, (Link("base", (wall,)),)))
+
+
 def check_asset(asset: Asset) -> None:
-    """Raise EngineError if physics can't hold the asset: its links and its mass must be valid in a bundle too."""
+    """Raise EngineError if physics can't hold the asset: its links and its mass must be valid in a bundle too.
+
+    An asset that passed is not checked again: a layout loads nearly equal scenes hundreds of times.
+    """
+    if id(asset) in _SOUND:
+        return
     try:
         asset_from_json(asset_to_json(replace(asset, supports=(), interiors=(), abilities={})))
     except SceneInvalidError as error:
         raise EngineError(f"physics can't hold asset {asset.asset_id!r}: {error}") from error
+    if len(_SOUND) >= ASSETS_KEPT:
+        _SOUND.clear()
+    _SOUND[id(asset)] = asset
+
+
+_SOUND: Final[dict[int, Asset]] = {}
+"""Assets that passed, by id. Holding the asset keeps its id from being reused."""
 
 
 def check_pose(pose: Pose, what: str) -> None:

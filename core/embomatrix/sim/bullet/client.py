@@ -89,6 +89,12 @@ class ClientPool:
         self._spare.clear()
 
 
+@functools.cache
+def shared_pool() -> ClientPool:
+    """Pool for the short-lived engines of this process: a layout opens one for each attempt."""
+    return ClientPool()
+
+
 def connect(*, renders: bool = False) -> BulletClient:
     """Open a client, without a renderer unless it ``renders``. Raises EngineError if Bullet has none left."""
     bullet = pybullet()

@@ -56,6 +56,7 @@ class BulletEngine:
         if prepared is None:
             check_scene(scene)
         self._scene = scene
+        self._is_prepared = prepared is not None
         self._owns_pool = pool is None
         self._pool = pool or ClientPool()
         self._bullet = self._pool.take()
@@ -263,7 +264,8 @@ class BulletEngine:
 
     def close(self) -> None:
         self._mini.close()
-        forget(self._scene.assets.values())
+        if self._is_prepared:  # the scenes of a layout, which are not, have nearly the same assets
+            forget(self._scene.assets.values())
         self._pool.give_back(self._bullet)
         if self._owns_pool:
             self._pool.close()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -118,6 +118,13 @@ class Solids:
         self._parts += parts
         self._owners += [owner] * len(parts)
         self._boxes = np.concatenate([self._boxes, np.asarray(rows).reshape(-1, 6)])
+
+    def remove(self, owners: Container[str]) -> None:
+        """Remove all parts of these owners."""
+        kept = [index for index, owner in enumerate(self._owners) if owner not in owners]
+        self._parts = [self._parts[index] for index in kept]
+        self._owners = [self._owners[index] for index in kept]
+        self._boxes = self._boxes[kept]
 
     def overlaps(
         self, parts: Iterable[Convex], *, ignore: str = "", tolerance_m: float = TOLERANCE_M

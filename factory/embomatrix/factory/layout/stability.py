@@ -10,6 +10,7 @@ from typing import Final
 
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.scenes.feasibility import SimulatedRobot
+from embomatrix.sim.bullet.client import shared_pool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
@@ -52,7 +53,7 @@ def settle(
     loose = {name for name in names if not editor.known(name).fixed and not is_provably_stable(editor, name)}
     rested: dict[str, Pose] = {}
     unstable: dict[str, str] = {}
-    with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id))) as engine:
+    with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id), shared_pool())) as engine:
         probe = _ReachProbe(engine)
         unreached: dict[str, str] = {}
         for name in [name for name in names if editor.box_of(name).low_m[2] < HIGH_M]:

@@ -24,7 +24,8 @@ def unserved(scene: Scene, floor: ReachableFloor) -> Iterator[tuple[SceneObject,
         if access is Access.NONE:
             continue
         front = None if access is Access.BESIDE else item.pose_world_asset
-        if not len(floor.spots(box_of(scene, item), front_of=front)):
+        box = floor.boxes.whole(scene.assets[item.asset_id], item.pose_world_asset)
+        if not len(floor.spots(box, front_of=front)):
             yield item, access
 
 

@@ -15,7 +15,7 @@ from embomatrix.factory.floorplan.spec import MIN_DOOR_M
 from embomatrix.factory.furnish.pieces import Access
 from embomatrix.factory.scenes.access import unserved
 from embomatrix.factory.scenes.clearance import Clearance
-from embomatrix.factory.scenes.floor import ReachableFloor, box_of
+from embomatrix.factory.scenes.floor import ReachableFloor, SceneBoxes, box_of
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.settling import settle_scene
 from embomatrix.sim.engine import FLOOR
@@ -224,9 +224,12 @@ def _background(scene: Scene) -> Iterator[SceneProblem]:
             yield SceneProblem(ProblemKind.FLOATING, names, "its underside rests on no surface of its host")
 
 
-def reach_problems(scene: Scene) -> Iterator[SceneProblem]:
-    """Yield rooms and furniture that the robot can't reach, and rooms with a blocked aisle."""
-    floor = ReachableFloor(scene)
+def reach_problems(scene: Scene, boxes: SceneBoxes | None = None) -> Iterator[SceneProblem]:
+    """Yield rooms and furniture that the robot can't reach, and rooms with a blocked aisle.
+
+    ``boxes`` are those of earlier, similar scenes.
+    """
+    floor = ReachableFloor(scene, boxes)
     if not floor.has_start:
         yield SceneProblem(
             ProblemKind.UNREACHABLE_ROOM, (scene.robot.room,), "the robot's start is not free floor"

@@ -15,7 +15,7 @@ from embomatrix.factory.clutter.space import TakenSpace, needed_space
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
-from embomatrix.factory.scenes.floor import ReachableFloor, box_at
+from embomatrix.factory.scenes.floor import ReachableFloor, SceneBoxes, box_at
 from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
@@ -67,13 +67,13 @@ class SceneEditor:
         """View of the base scene."""
         self._objects: dict[str, SceneObject] = {item.name: item for item in scene.objects}
         self._assets: dict[str, Asset] = dict(scene.assets)
-        self._boxes: dict[str, Aabb] = {}
         self._background = scene.background
         self._solids = Solids.of_scene(replace(scene, background=()))
         self._kept: set[str] = set()
-        self.floor = ReachableFloor(scene)
+        self._boxes = SceneBoxes()
+        self.floor = ReachableFloor(scene, self._boxes)
         """Floor that the robot can reach in the current scene."""
-        self._unreached = {problem.names for problem in reach_problems(scene)}
+        self._unreached = {problem.names for problem in reach_problems(scene, self._boxes)}
         self.unserved = frozenset(name for names in self._unreached for name in names)
         """Objects of the base scene that the robot can't reach initially."""
         self.given_up: set[str] = set()
@@ -105,11 +105,7 @@ class SceneEditor:
 
     def box_of(self, name: str) -> Aabb:
         """Return an object's box in the world with closed joints. Raise PlacementError for an unknown name."""
-        box = self._boxes.get(name)
-        if box is None:
-            item = self.known(name)
-            box = self._boxes[name] = box_at(self._assets[item.asset_id], item.pose_world_asset)
-        return box
+        return self._boxes.whole(self.asset_of(name), self.known(name).pose_world_asset)
 
     def keep(self, names: Iterable[str]) -> None:
         """Protect objects of the base scene that the task is about."""
@@ -160,7 +156,7 @@ class SceneEditor:
         self._solids.add(name, placed_parts(asset, pose))
         self._clear_around(name)
         if box.low_m[2] < _ON_FLOOR_M:
-            self.floor = ReachableFloor(self._as_scene())
+            self._update_floor()
         return name
 
     def fasten(self, name: str) -> None:
@@ -180,7 +176,8 @@ class SceneEditor:
                 gone[item.name] = None
         for each in gone:
             del self._objects[each]
-        self._refresh(gone)
+        self._solids.remove(gone)
+        self._update_floor()
         return tuple(gone)
 
     def move(self, poses: Mapping[str, Pose]) -> None:
@@ -188,8 +185,11 @@ class SceneEditor:
         for name, pose in poses.items():
             self._objects[name] = replace(self.known(name), pose_world_asset=pose)
             self._clear_around(name)
+        self._solids.remove(poses)
+        for name, pose in poses.items():
+            self._solids.add(name, placed_parts(self.asset_of(name), pose))
         if poses:
-            self._refresh(poses)
+            self._update_floor()
 
     def add_pieces(self, whole: str, asset: Asset, count: int) -> tuple[str, ...]:
         """Add absent objects that appear when ``whole`` is sliced, and return their names. Raise PlacementError."""
@@ -246,12 +246,8 @@ class SceneEditor:
             assets=self._assets,
         )
 
-    def _refresh(self, changed: Mapping[str, object]) -> None:
-        for name in changed:
-            self._boxes.pop(name, None)
-        scene = self._as_scene()
-        self._solids = Solids.of_scene(replace(scene, background=()))
-        self.floor = ReachableFloor(scene)
+    def _update_floor(self) -> None:
+        self.floor = ReachableFloor(self._as_scene(), self._boxes)
 
     def _clear_around(self, name: str) -> None:
         """Remove the background where an object needs space, and what stands on removed background."""
@@ -275,7 +271,7 @@ class SceneEditor:
         assets = {**self._assets, asset.asset_id: asset}
         trial = replace(self.base, objects=(*self._objects.values(), item), background=(), assets=assets)
         known = self._unreached | {(name,) for name in self.given_up}
-        return {problem.names for problem in reach_problems(trial)} <= known
+        return {problem.names for problem in reach_problems(trial, self._boxes)} <= known
 
 
 def add_floor(editor: SceneEditor, room: str) -> str:

@@ -1,5 +1,6 @@
 """Floor of a scene that the robot can reach, and the places on it from which the arm reaches an object."""
 
+import functools
 import math
 from collections.abc import Iterable, Iterator
 from typing import Final
@@ -21,16 +22,56 @@ _REACH_SLACK_M: Final = 0.05
 _FRONT_COSINE: Final = math.cos(math.radians(65.0))
 
 
+class SceneBoxes:
+    """Boxes of walls and objects, computed once for each asset, pose and joint position.
+
+    Scenes that differ by objects alone share them: an editor judges hundreds of poses, each in a scene of its own. Equal
+    names of assets must mean equal assets.
+    """
+
+    def __init__(self) -> None:
+        self._whole: dict[tuple[str, Pose], Aabb] = {}
+        self._parts: dict[tuple[str, Pose, tuple[float, ...]], FloatArray] = {}
+        self._walls: FloatArray | None = None
+
+    def whole(self, asset: Asset, pose: Pose) -> Aabb:
+        """Return the bounding box in the world of an asset at a pose, with its joints shut."""
+        key = (asset.asset_id, pose)
+        box = self._whole.get(key)
+        if box is None:
+            box = self._whole[key] = box_at(asset, pose)
+        return box
+
+    def barring_parts(self, asset: Asset, item: SceneObject) -> FloatArray:
+        """Return the rows of an object's parts that block the robot, with its current joint positions, shape (n, 6)."""
+        key = (asset.asset_id, item.pose_world_asset, item.joints)
+        rows = self._parts.get(key)
+        if rows is None:
+            rows = self._parts[key] = _barring(_part_boxes(asset, item))
+        return rows
+
+    def barring_walls(self, scene: Scene) -> FloatArray:
+        """Return the rows of the walls that block the robot, shape (n, 6)."""
+        if self._walls is None:
+            self._walls = _barring(wall.aabb(IDENTITY) for wall in scene.walls)
+        return self._walls
+
+
 class ReachableFloor:
     """Free floor connected to the robot's start. Open doors and drawers occupy floor."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, boxes: SceneBoxes | None = None) -> None:
         self._rooms = scene.rooms
-        walls = [wall.aabb(IDENTITY) for wall in scene.walls]
-        self._standing = _barring(box for item in scene.objects for box in _part_boxes(scene, item))
-        boxes = [box_of(scene, item) for item in scene.objects]
-        self._footprints = _barring(boxes)[:, :4]
-        self._grid = FloorGrid(scene, np.concatenate([_barring(walls), self._standing]))
+        self.boxes = boxes or SceneBoxes()
+        """Boxes of the scene, and of earlier ones that shared them."""
+        placed = [(scene.assets[item.asset_id], item) for item in scene.objects]
+        self._standing = np.concatenate(
+            [np.empty((0, 6)), *(self.boxes.barring_parts(asset, item) for asset, item in placed)]
+        )
+        self._footprints = _barring(self.boxes.whole(asset, item.pose_world_asset) for asset, item in placed)[
+            :, :4
+        ]
+        self._grid = FloorGrid(scene, np.concatenate([self.boxes.barring_walls(scene), self._standing]))
         cell = self._grid.cell(scene.robot.x_m, scene.robot.y_m)
         self._label = self._grid.label(cell) if cell is not None else 0
 
@@ -63,10 +104,14 @@ class ReachableFloor:
 
     def cut_off_m2(self, room: Room) -> float:
         """Return the area of the room's floor on which the robot fits but which it can't reach, outside of objects' boxes."""
-        islands = set(np.unique(self._grid.labels).tolist()) - {0, self._label}
-        centers = [self._grid.free_centers(room.low_m, room.high_m, label) for label in sorted(islands)]
+        centers = [self._grid.free_centers(room.low_m, room.high_m, label) for label in self._islands]
         spots = np.concatenate([np.empty((0, 2)), *centers])
         return int((~_within(spots, self._footprints)).sum()) * CELL_M**2
+
+    @functools.cached_property
+    def _islands(self) -> list[int]:
+        """Labels of free floor that the robot can't reach."""
+        return sorted(set(np.unique(self._grid.labels).tolist()) - {0, self._label})
 
     def spots(self, box: Aabb, *, front_of: Pose | None = None) -> FloatArray:
         """Return the cells from which the arm reaches a box, shape (n, 2); only those before the front of ``front_of``."""
@@ -100,10 +145,10 @@ def box_at(asset: Asset, pose: Pose) -> Aabb:
     return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
 
 
-def _part_boxes(scene: Scene, item: SceneObject) -> Iterator[Aabb]:
+def _part_boxes(asset: Asset, item: SceneObject) -> Iterator[Aabb]:
     """Yield the boxes in the world of an object's parts with their current joint positions."""
     shares = iter(item.joints)
-    for link in scene.assets[item.asset_id].links:
+    for link in asset.links:
         frame = item.pose_world_asset
         if link.joint is not None and (share := next(shares, 0.0)):
             frame = frame @ joint_motion(link.joint, share)
