@@ -2,18 +2,24 @@
 
 import dataclasses
 
+import numpy as np
+import pytest
 from tests.fakes.problems import PROBLEM, source
 
+from embomatrix.factory.admission import RefusedError
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import bind_first
 from embomatrix.factory.task_import.dialects import without_places_left
 from embomatrix.factory.task_import.missing_sources import with_missing_sources
 from embomatrix.factory.task_import.report import ProblemOutcome, evaluation_of, report_to_json
 from embomatrix.factory.task_import.scene_changes import RoomStock, SceneChange, find_right_scene, lacking
+from embomatrix.factory.task_import.search import BindingOptions, search
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import ImportedTask
+from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, import_problem
 from embomatrix.factory.task_import.task_fields import instruction_of
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.evaluate import render
+from embomatrix.world.scene import Scene
 
 TWO_ROOMS = parse_problem("""(define (problem p) (:domain omnigibson)
     (:objects sofa.n.01_1 sofa.n.01_2 - sofa.n.01 apple.n.01_1 - apple.n.01 bed.n.01_1 - bed.n.01)
@@ -99,7 +105,7 @@ def test_goal_that_repeats_the_start_is_read_without_it() -> None:
     assert without_places_left(problem) == (problem, ())
 
 
-def test_fridge_is_added_to_a_scene_without_cold_for_a_goal_that_needs_it(home) -> None:
+def test_fridge_is_added_to_a_scene_without_cold_for_a_goal_that_needs_it(home: Scene) -> None:
     start = PROBLEM[: PROBLEM.index("(:goal")].replace("electric_refrigerator", "breakfast_table")
     problem = parse_problem(start + "(:goal (frozen apple.n.01_1)))")
     assert with_missing_sources(problem, home) == problem
@@ -108,3 +114,48 @@ def test_fridge_is_added_to_a_scene_without_cold_for_a_goal_that_needs_it(home) 
         ("electric_refrigerator.n.01_1", "electric_refrigerator.n.01")
     }
     assert ("electric_refrigerator.n.01_1", "kitchen") in added.initial_pairs("inroom")
+
+
+def test_oven_is_added_beside_a_microwave_for_food_that_it_only_warms(home: Scene) -> None:
+    start = PROBLEM[: PROBLEM.index("(:goal")].replace("electric_refrigerator.n.01", "microwave.n.02")
+    bare = dataclasses.replace(home, objects=())
+
+    def added(food: str, state: str) -> set[str]:
+        text = start.replace("apple.n.01", food) + f"(:goal ({state} {food}_1)))"
+        problem = parse_problem(text)
+        return set(with_missing_sources(problem, bare).objects) - set(problem.objects)
+
+    assert added("tortilla.n.01", "cooked") == {"oven.n.01_1"}
+    assert added("tortilla.n.01", "hot") == set()
+
+
+def test_furniture_whose_doors_are_blocked_is_not_used(home: Scene) -> None:
+    problem, view = parse_problem(PROBLEM), SceneView(home)
+    inroom = dict(problem.initial_pairs("inroom"))
+    fixtures = ["electric_refrigerator.n.01_1"]
+
+    def found(options: BindingOptions) -> str:
+        rng = np.random.default_rng(0)
+        return search(problem, view, inroom, fixtures, rng, options, ())[1].get(fixtures[0], "")
+
+    bare = BindingOptions(furnishing=False, usable=True)
+    fridge = found(bare)
+    assert fridge.startswith("fridge")
+    view._opens[fridge] = False
+    with pytest.raises(RefusedError, match="no free object for electric_refrigerator"):
+        found(bare)
+    assert found(BindingOptions(furnishing=False)) == fridge
+
+
+def test_places_of_the_goal_are_cleared_of_background(flat: Scene) -> None:
+    text = """(define (problem p) (:domain omnigibson)
+        (:objects rag.n.01_1 - rag.n.01 sink.n.01_1 - sink.n.01 fridge - electric_refrigerator.n.01)
+        (:init (inroom sink.n.01_1 kitchen) (inroom fridge kitchen) (inside rag.n.01_1 fridge))
+        (:goal (inside rag.n.01_1 sink.n.01_1)))"""
+    kept = import_problem(source(text), flat)
+    cleared = import_problem(source(text), flat, options=ImportOptions(usable=True))
+    assert isinstance(kept, ImportedTask)
+    assert isinstance(cleared, ImportedTask)
+    beside = {item for item in kept.scene.background if item.host == "furniture_sink_1"}
+    assert len(beside) > 3
+    assert set(kept.scene.background) - set(cleared.scene.background) == beside

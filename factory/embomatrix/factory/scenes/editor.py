@@ -180,6 +180,11 @@ class SceneEditor:
         self._update_floor()
         return tuple(gone)
 
+    def clear(self, name: str) -> None:
+        """Remove the background objects on an object. Raise PlacementError for an unknown name."""
+        host = self.known(name).name
+        self._background = tuple(item for item in self._background if item.host != host)
+
     def move(self, poses: Mapping[str, Pose]) -> None:
         """Set the poses of objects. Background gives way. Raise PlacementError for an unknown name."""
         for name, pose in poses.items():

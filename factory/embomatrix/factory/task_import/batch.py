@@ -44,7 +44,7 @@ OWN_SCENE_DRAWS: Final = 3
 MAX_UNSOLVED: Final = 6
 """Maximum number of scenes in which a problem is laid out but not solved. Then the problem itself is the cause.
 
-The same number of scenes is tried again with a compact layout if objects share a cavity or a surface.
+The same number of scenes is tried again with a compact layout if objects are on or in others.
 """
 MAX_SAME_REFUSAL: Final = 3
 """Maximum number of such scenes in a row with the same refusal."""
@@ -103,8 +103,9 @@ def imports(
         if isinstance(outcome, TaskRefusal) and options.furnishing:
             yield import_problem(source, base, seed=drawn, options=options)
     changed: list[ImportedTask] = []
-    for tried, scenes in ((bare, others), (replace(bare, renumbering=True), [*own, *others])):
-        for outcome in _round(source, scenes, seed, tried):
+    renumbered = replace(bare, renumbering=True)
+    for number, (tried, scenes) in enumerate(((bare, others), (renumbered, [*own, *others]))):
+        for outcome in _round(source, scenes, seed + number * SEED_STRIDE, tried):
             if isinstance(outcome, ImportedTask) and outcome.changes:
                 changed.append(outcome)
                 if len(changed) >= MAX_CHANGED:
@@ -115,8 +116,10 @@ def imports(
                 return
     yield from sorted(changed, key=lambda imported: len(imported.changes))
     if options.furnishing:
-        yield from _round(source, others, seed, options)
-        yield from _round(source, [*own, *others], seed, replace(options, renumbering=True))
+        # Another seed: the rounds before have laid out some of these scenes already.
+        yield from _round(source, others, seed + 2 * SEED_STRIDE, options)
+        again = replace(options, renumbering=True)
+        yield from _round(source, [*own, *others], seed + 3 * SEED_STRIDE, again)
 
 
 def _by_lack(source: SourceText, bases: Sequence[Scene]) -> list[Scene]:
@@ -157,10 +160,14 @@ def verify_first(
     """
 
     def outcomes() -> Iterator[Verified | TaskRefusal]:
-        for compact in (False, True) if has_shared_host(source) else (False,):
+        for compact in (False, True) if has_host(source) else (False,):
             laid_out, misfits, sentences = 0, 0, list[str]()
             for imported in imports(
-                source, bases, seed=seed, options=ImportOptions(compact=compact), draws=OWN_SCENE_DRAWS
+                source,
+                bases,
+                seed=seed,
+                options=ImportOptions(compact=compact, usable=True),
+                draws=OWN_SCENE_DRAWS,
             ):
                 if isinstance(imported, TaskRefusal):
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
@@ -179,10 +186,10 @@ def verify_first(
     return _first(outcomes())
 
 
-def has_shared_host(source: SourceText) -> bool:
-    """True if several objects share a host at the start or in the goal. Raise BddlError."""
+def has_host(source: SourceText) -> bool:
+    """True if an object is on or in another one at the start or in the goal. Raise BddlError."""
     problem, _ = read_problem(source)
-    return any(max(len(each.contents), len(each.burden)) > 1 for each in requirements_of(problem).values())
+    return any(each.contents or each.burden for each in requirements_of(problem).values())
 
 
 T = TypeVar("T", ImportedTask, Verified)

@@ -4,11 +4,12 @@ The paper's tasks freeze food in coolers, which only keep drinks cool.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.skills.appliances import cold_source, freezes, heat_source, heats
+from embomatrix.skills.appliances import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.world.asset import Asset
 from embomatrix.world.bddl import BddlProblem, InitLiteral
 from embomatrix.world.catalog import Catalog
@@ -18,22 +19,32 @@ from embomatrix.world.scene import Scene
 from embomatrix.world.state import THERMAL, Relation, State
 
 
-def _gives_cold(asset: Asset) -> bool:
+def _gives_cold(asset: Asset, _: Sequence[Asset]) -> bool:
     source = cold_source(asset)
     return source is not None and freezes(source)
 
 
-def _gives_heat(asset: Asset) -> bool:
+def _gives_heat(asset: Asset, _: Sequence[Asset]) -> bool:
     source = heat_source(asset)
     return source is not None and heats(source)
 
 
-SOURCES: Final[Mapping[State, tuple[str, Callable[[Asset], bool]]]] = {
+def _cooks_all(asset: Asset, foods: Sequence[Asset]) -> bool:
+    """True if the asset cooks each of the foods: a microwave warms a tortilla and doesn't bake it."""
+    source = heat_source(asset)
+    return (
+        source is not None
+        and heats(source)
+        and all(cooks(source, food) for food in foods if food.can("cookable"))
+    )
+
+
+SOURCES: Final[Mapping[State, tuple[str, Callable[[Asset, Sequence[Asset]], bool]]]] = {
     State.FROZEN: ("electric_refrigerator.n.01", _gives_cold),
     State.HOT: ("oven.n.01", _gives_heat),
-    State.COOKED: ("oven.n.01", _gives_heat),
+    State.COOKED: ("oven.n.01", _cooks_all),
 }
-"""Type of the appliance that is added for each state, and the test of a sufficient one."""
+"""Type of the appliance that is added for each state, and the test of a sufficient one for some objects."""
 
 
 def with_missing_sources(problem: BddlProblem, base: Scene) -> BddlProblem:
@@ -42,20 +53,32 @@ def with_missing_sources(problem: BddlProblem, base: Scene) -> BddlProblem:
     It stands in the first room that the start names. Goals that name their source, and starts without rooms, get none.
     """
     rooms = problem.initial_pairs(Relation.INROOM)
-    wanted = {
-        State(a.predicate) for a in atoms_of(problem.goal) if a.predicate in THERMAL and len(a.args) == 1
-    }
+    wanted: defaultdict[State, set[str]] = defaultdict(set)
+    for atom in atoms_of(problem.goal):
+        if atom.predicate in THERMAL and len(atom.args) == 1:
+            name = atom.args[0].lstrip("?")
+            wanted[State(atom.predicate)].add(problem.objects.get(name, name))
     if not rooms or not wanted:
         return problem
     assets = [base.asset_of(item.name) for item in base.objects if item.fixed]
     assets += _assets_of(set(problem.objects.values()))
-    lacking = {SOURCES[state][0] for state in wanted if not any(map(SOURCES[state][1], assets))}
+    lacking = {
+        SOURCES[state][0]
+        for state, types in wanted.items()
+        if not _has_source(assets, SOURCES[state][1], _assets_of(types))
+    }
     objects, init = dict(problem.objects), list(problem.init)
     for type_name in sorted(lacking):
         name = f"{type_name}_{len(problem.types.get(type_name, ())) + 1}"
         objects[name] = type_name
         init.append(InitLiteral(Atom(Relation.INROOM.value, (name, rooms[0][1]))))
     return dataclasses.replace(problem, objects=objects, init=tuple(init))
+
+
+def _has_source(
+    assets: Iterable[Asset], suffices: Callable[[Asset, Sequence[Asset]], bool], treated: Sequence[Asset]
+) -> bool:
+    return any(suffices(asset, treated) for asset in assets)
 
 
 def _assets_of(types: Iterable[str]) -> list[Asset]:

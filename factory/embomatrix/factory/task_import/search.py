@@ -36,6 +36,8 @@ SIMILAR_ROOMS: Final[Mapping[str, str]] = {
 """Room types that replace a missing type when rooms are renumbered."""
 COVER_M: Final = 0.08
 """Objects within this height above a surface cover it."""
+DOORS: Final = frozenset({"openable", "container"})
+"""Abilities that need doors, if there are any."""
 MAX_CHOICES: Final = 200
 """Maximum number of room assignments tried."""
 
@@ -50,6 +52,11 @@ class BindingOptions:
     """If true, goals that no skill reaches are refused. Otherwise goals must only be evaluable."""
     renumbering: bool = False
     """If true, ``kitchen_0`` may be another kitchen, since other datasets number rooms differently."""
+    usable: bool = False
+    """If true, furniture that the goal fills or opens has doors that open, and its top is free of background objects.
+
+    Days lay out scenes without it: what they give is frozen by digest.
+    """
     categories: Mapping[str, str] = field(default_factory=dict)
     """Category of an object by its name, where the type alone leaves a choice."""
 
@@ -167,6 +174,7 @@ def _domains(
             if view.category(other) in categories
             and other not in excluded
             and has_abilities(view.asset(other), needs.get(name, frozenset()))
+            and not (options.usable and DOORS & needs.get(name, frozenset()) and not view.opens(other))
             and not (requirement.carried and _is_too_heavy(view, other))
         ]
         if fits:

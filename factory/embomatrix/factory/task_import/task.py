@@ -43,7 +43,7 @@ from embomatrix.world.catalog import Catalog, Model, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
 from embomatrix.world.goal import Atom
 from embomatrix.world.scene import Scene
-from embomatrix.world.state import SubstanceRelation
+from embomatrix.world.state import Relation, SubstanceRelation
 from embomatrix.world.substances import flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task
 
@@ -87,7 +87,7 @@ class ImportOptions(BindingOptions):
 
     lay: Lay = lay
     compact: bool = False
-    """If true, objects that share a host are scaled to fit side by side."""
+    """If true, objects that share a host are scaled to fit side by side, and hosts have room for what the goal puts there."""
 
 
 def import_problem(
@@ -134,11 +134,22 @@ class _Binder:
             names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
         for name in self._portable_fixtures(editor, names):
             editor.loosen(name)
+        if self._options.usable:
+            for host in self._goal_hosts():
+                if names.get(host) in editor.objects:
+                    editor.clear(names[host])
         for floor in self._floor_objects(editor, names, binding):
             names[floor] = self._add_floor(editor, floor, binding)
         start = self._start(names, binding)
         scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
         return self._task(scene, names, binding, start)
+
+    def _goal_hosts(self) -> Iterator[str]:
+        """Yield the problem's objects on or in which the goal may put something."""
+        for atom in atoms_of(self._problem.goal):
+            if atom.predicate in (Relation.ONTOP, Relation.INSIDE):
+                host = atom.args[1].lstrip("?")
+                yield from self._problem.types.get(host, (host,))
 
     def _bound(self) -> tuple[Binding, SceneEditor, dict[str, str]]:
         """Bind the problem and lay it out. Furniture that can't hold the problem's objects is excluded in further attempts.
