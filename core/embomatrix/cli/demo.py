@@ -15,11 +15,14 @@ from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cl
 from embomatrix.host.failure import fail
 from embomatrix.starter.archive import unpack
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
+from embomatrix.world.json_text import parse_json
 
 DEFAULT_OUT: Final = Path("runs/demo")
 IMITATION_STEPS: Final = 340
 GRPO_STEPS: Final = 420
 """Budgets in steps: the same seed gives the same curve on a fast machine and on a slow one."""
+OUTCOME_FILE: Final = "outcome.json"
+"""File of a finished run with its success on each held-out task."""
 EVALUATE_EVERY: Final = 70
 """Steps of GRPO between evaluations: five beside those before and after, each in a few seconds."""
 console = Console()
@@ -71,12 +74,19 @@ def demo(
         f"tasks {built_s - started_s:.0f} s, training {ended_s - built_s:.0f} s, logs in {folder / 'cluster' / 'logs'}",
         highlight=False,
     )
-    heldout = Dataset.load(dataset).heldout
-    if heldout:
+    task_id = _most_successful_task(folder)
+    if task_id:
         # Rich would wrap a line that is meant to be copied.
-        typer.echo(
-            f"try next: embomatrix play {heldout[0].task.task_id} --policy {folder} --dataset {dataset}"
-        )
+        typer.echo(f"try next: embomatrix play {task_id} --policy {folder} --dataset {dataset}")
+
+
+def _most_successful_task(folder: Path) -> str:
+    """Return the held-out task that the run's policy solves most often; "" without held-out tasks."""
+    rates: dict[str, float] = {
+        task["task_id"]: task["rate"] or 0.0
+        for task in parse_json((folder / OUTCOME_FILE).read_bytes())["after"]
+    }
+    return max(rates, key=rates.__getitem__, default="")
 
 
 def _ensure_tasks(dataset: Path) -> None:
