@@ -4,7 +4,6 @@ The plan is a person's, the oracle's or a trained policy's.
 """
 
 import contextlib
-import os
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -22,6 +21,7 @@ from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, d
 from embomatrix.host.printable import printable
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score, unparsable
+from embomatrix.scripts.similarity import TermIndex, words_in
 from embomatrix.sim.film import Film, film_cached
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.physical.film import film_physical
@@ -33,13 +33,13 @@ from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for, situation_of
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, Plan
 from embomatrix.skills.trace import Trace
+from embomatrix.starter.shipped import DATASET_VARIABLE, DEFAULT_DATASET, dataset_folder
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.dataset import Dataset
+from embomatrix.world.dataset import Dataset, TaskRecord
 from embomatrix.world.evaluate import GoalError
 from embomatrix.world.task import Task
 from embomatrix.world.whole_file import check_writable
 
-DEFAULT_DATASET: Final = "build/dataset"
 NO_PLAN: Final = 1
 
 console = Console(highlight=False)
@@ -58,7 +58,12 @@ class PlayMode(StrEnum):
 
 
 def play(
-    task: Annotated[str, typer.Argument(help="Id of a task in the dataset.")],
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="Id of a task, or words: the task whose instruction is most like them is played."
+        ),
+    ],
     plan: Annotated[
         str,
         typer.Option(
@@ -67,8 +72,10 @@ def play(
     ] = "",
     oracle: Annotated[bool, typer.Option("--oracle", help="Execute the oracle planner's plan.")] = False,
     policy: Annotated[
-        Path | None,
-        typer.Option(help="Execute the plan of a trained policy: the folder of a run, such as runs/demo."),
+        str | None,
+        typer.Option(
+            help="Execute the plan of a trained policy: the folder of a run, such as runs/demo, or `shipped`."
+        ),
     ] = None,
     show: Annotated[
         bool,
@@ -81,7 +88,9 @@ def play(
     ] = False,
     dataset: Annotated[
         Path | None,
-        typer.Option(help=f"Folder of the dataset. Default: $EMBOMATRIX_DATASET, or {DEFAULT_DATASET}."),
+        typer.Option(
+            help=f"Folder of the dataset. Default: ${DATASET_VARIABLE}, or {DEFAULT_DATASET}, or the shipped tasks."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the execution.")] = 0,
     mode: Annotated[
@@ -105,9 +114,8 @@ def play(
             fail(
                 "expected one of --plan FILE, --oracle, --policy FOLDER, --interactive and --show: give one of them"
             )
-        root = dataset if dataset is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
-        data = Dataset.load(root)
-        record = data.find(task)
+        data = Dataset.load(dataset_folder(dataset))
+        record = _record_of(data, task)
         bundle = data.bundle(record.bundle_digest)
         text = _text_of(plan) if plan else None
         _show_task(record.task)
@@ -121,7 +129,17 @@ def play(
             _run(bundle, record.task, found, mode, seed, film)
 
 
-def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: Path | None, seed: int) -> Plan:
+def _record_of(data: Dataset, named: str) -> TaskRecord:
+    """Return the task with an id, or the one whose instruction is most like some words. Raise DatasetError."""
+    if len(named.split()) < 2 or not data.records:
+        return data.find(named)
+    index = TermIndex([words_in(record.task.instruction) for record in data.records])
+    record = data.records[index.ranked(words_in(named))[0]]
+    console.print(f"the task most like these words, of {len(data.records)}:", style="dim")
+    return record
+
+
+def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: str | None, seed: int) -> Plan:
     """Parse the text, or ask the policy, or else the oracle. Exit if there is no plan."""
     if text is None and policy is None:
         found = find_plan(load_simulator(bundle), task)
@@ -159,7 +177,7 @@ def _play_by_hand(bundle: Bundle, task: Task, seed: int) -> None:
         _show_reward(reward)
 
 
-def _plan_of_policy(folder: Path, situation: Situation, seed: int) -> Plan:
+def _plan_of_policy(named: str, situation: Situation, seed: int) -> Plan:
     """Return the most probable plan of a trained policy. Raises PlanError if it writes none."""
     import torch
 
@@ -168,7 +186,7 @@ def _plan_of_policy(folder: Path, situation: Situation, seed: int) -> Plan:
     from embomatrix.trainer.evaluation.models import load_model
 
     try:
-        policy, settings = load_model(str(folder), None, threads=None, device="cpu")
+        policy, settings = load_model(named, None, threads=None, device="cpu")
     except TrainerError as error:
         fail(str(error))
     asked = limited(situation, settings.prompt.rows)

@@ -1,4 +1,4 @@
-"""`embomatrix model`: convert packaged language models to folders that can be trained."""
+"""`embomatrix model`: convert packaged language models, and release trained policies."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
 @app.callback()
 def model() -> None:
-    """Convert packaged language models to folders that can be trained."""
+    """Convert packaged language models, and release trained policies."""
 
 
 @app.command("import-gguf")
@@ -35,3 +35,24 @@ def import_gguf_command(
     Console().print(
         f"model written to {out}: train it with `embomatrix train --model {out}`", highlight=False
     )
+
+
+@app.command("release")
+def release_command(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run, such as runs/demo.")],
+    out: Annotated[Path, typer.Argument(help="New folder for the policy and its card.")],
+    command: Annotated[
+        str, typer.Option(help="Command that trained it, for the card.")
+    ] = "embomatrix demo --seed 0",
+) -> None:
+    """Write the policy of a finished run without its state of training, with a card of what it was trained on and its success.
+
+    `embomatrix play` and `embomatrix eval --model` take the folder.
+    """
+    from embomatrix.trainer.run.release import release
+
+    try:
+        folder = release(run, out, command)
+    except TrainerError as error:
+        fail("model", str(error))
+    typer.echo(f"policy written to {folder}: try `embomatrix play TASK --policy {folder}`")

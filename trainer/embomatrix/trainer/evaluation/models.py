@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from embomatrix.skills.prompt import Codec
+from embomatrix.starter.shipped import SHIPPED, shipped_policy
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import (
     LANGUAGE_MODEL_DEFAULTS,
@@ -22,11 +23,12 @@ from embomatrix.trainer.policy.tiny import TinyPolicy
 def load_model(
     named: str, codec: Codec | None, *, threads: int | None, device: str
 ) -> tuple[Policy, TrainSettings]:
-    """Load a policy with its settings. The folder of a run stands for its newest checkpoint. Raises TrainerError.
+    """Load a policy with its settings. Raises TrainerError.
 
-    A trained policy keeps its codec; any other model uses ``codec``, by default JSON.
+    The folder of a run stands for its newest checkpoint, and ``shipped`` for the policy that ships with the package. A trained
+    policy keeps its codec; any other model uses ``codec``, by default JSON.
     """
-    folder = Path(named)
+    folder = shipped_policy() if named == SHIPPED else Path(named)
     if (folder / CHECKPOINTS).is_dir():
         folder = CheckpointStore(folder / CHECKPOINTS, keep=1).latest() or folder
     if folder.is_dir() and (folder / "policy").is_dir():

@@ -20,7 +20,7 @@ from embomatrix.world.json_text import parse_json
 SCHEMA = 3
 CHECKPOINTS = "checkpoints"
 """Name of the checkpoints folder in a run's folder."""
-_STATE = "state.json"
+STATE = "state.json"
 _TENSORS = "training.pt"
 _PREFIXES = ("imitation-", "step-")
 """Folder prefixes of the two phases. Their alphabetical order is the order of the phases."""
@@ -86,7 +86,7 @@ class CheckpointStore:
                 "progress": asdict(progress),
                 "settings": settings.model_dump(mode="json"),
             }
-            (partial / _STATE).write_text(json.dumps(state, indent=1), encoding="utf-8")
+            (partial / STATE).write_text(json.dumps(state, indent=1), encoding="utf-8")
             _sync(partial)
         for old in self._all()[: -self._keep]:
             shutil.rmtree(old, ignore_errors=True)
@@ -101,7 +101,7 @@ class CheckpointStore:
             path
             for prefix in _PREFIXES
             for path in self._folder.glob(f"{prefix}*")
-            if (path / _STATE).is_file()
+            if (path / STATE).is_file()
         )
 
 
@@ -135,7 +135,7 @@ def _sync(folder: Path) -> None:
 def read_state(folder: Path) -> tuple[TrainingProgress, TrainSettings]:
     """Read a checkpoint's progress and settings. Raises TrainerError if it is damaged or of another version."""
     try:
-        state = parse_json((folder / _STATE).read_bytes())
+        state = parse_json((folder / STATE).read_bytes())
         if state["schema"] != SCHEMA:
             raise TrainerError(
                 f"the checkpoint {folder} has schema {state['schema']}, this version reads {SCHEMA}: start a new run"
@@ -145,7 +145,7 @@ def read_state(folder: Path) -> tuple[TrainingProgress, TrainSettings]:
         return progress, TrainSettings.model_validate(state["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainerError(
-            f"{folder} is not a readable checkpoint ({_STATE}: {reason_of(error)}): pass a folder such as "
+            f"{folder} is not a readable checkpoint ({STATE}: {reason_of(error)}): pass a folder such as "
             "runs/NAME/checkpoints/step-000050"
         ) from error
 

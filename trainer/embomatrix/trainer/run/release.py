@@ -1,0 +1,97 @@
+"""Release of a run's policy: its newest checkpoint without the state of training, with a card that says what it is."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.host.code_version import commit_here
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.evaluation.intervals import bootstrap, mean_over_tasks
+from embomatrix.trainer.lifecycle.checkpoint import (
+    CHECKPOINTS,
+    STATE,
+    CheckpointStore,
+    atomic_folder,
+    read_state,
+)
+from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, read_outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.lifecycle.checkpoint import TrainingProgress
+    from embomatrix.trainer.logging.outcome import TaskRate
+
+CARD: Final = "CARD.md"
+POLICY: Final = "policy"
+
+
+def release(run: Path, out: Path, command: str) -> Path:
+    """Write the policy of a finished run with its card to a new folder, which can be evaluated and played.
+
+    ``command`` is the one that trained it. Raises TrainerError for an unfinished run, or if ``out`` exists.
+    """
+    if out.exists():
+        raise TrainerError(f"{out} exists: give a new folder, or remove it")
+    outcome = read_outcome(run)
+    newest = CheckpointStore(run / CHECKPOINTS, keep=1).latest()
+    if newest is None:
+        raise TrainerError(f"{run} has no checkpoint: give the folder of a run, such as runs/demo")
+    progress, settings = read_state(newest)
+    made = datetime.fromtimestamp((run / OUTCOME).stat().st_mtime, UTC)
+    card = card_of(outcome, progress, settings, command, f"{made:%Y-%m-%d}")
+    with atomic_folder(out) as partial:
+        shutil.copytree(newest / POLICY, partial / POLICY)
+        shutil.copy(newest / STATE, partial / STATE)
+        (partial / CARD).write_text(card, encoding="utf-8")
+    return out
+
+
+def card_of(
+    outcome: RunOutcome, progress: TrainingProgress, settings: TrainSettings, command: str, day: str
+) -> str:
+    """Return the card as Markdown."""
+    gain = bootstrap(_differences(outcome.before, outcome.after))
+    lines = [
+        "# A small policy for household plans",
+        "",
+        f"Trained on {day} by `{command}`: {outcome.imitation_steps} steps of imitation and {outcome.steps} of GRPO "
+        f"with {outcome.rollouts:,} rollouts, seed {settings.seed}, in {outcome.wall_s / 60:.0f} minutes. The card was written "
+        f"at `{commit_here()}`. Digest of the tasks that it was trained and tested on: `{progress.dataset}`.",
+        "",
+        "Success on held-out tasks, mean over tasks and samples, with 95 % intervals over tasks:",
+        "",
+        "| category | tasks | after imitation | after GRPO |",
+        "| --- | ---: | ---: | ---: |",
+    ]
+    for category in ("", *sorted({rate.category for rate in outcome.after})):
+        before, after = (_of(rates, category) for rates in (outcome.before, outcome.after))
+        lines.append(
+            f"| {(category or 'all').replace('_', ' ')} | {len(after)} | {_success(before)} | {_success(after)} |"
+        )
+    lines += [
+        "",
+        f"Difference: {gain.as_percent()}. One seed.",
+        "",
+        "It reads instructions of the words that its training tasks use, and fails at most others. It knows no scene but those "
+        "of its prompt, and was never tested on a real robot. Licence: MIT, as the package.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _of(rates: Sequence[TaskRate], category: str) -> list[float]:
+    return [rate.rate for rate in rates if category in ("", rate.category) and rate.rate is not None]
+
+
+def _success(rates: Sequence[float]) -> str:
+    return mean_over_tasks(rates).interval.as_percent()
+
+
+def _differences(before: Sequence[TaskRate], after: Sequence[TaskRate]) -> list[float]:
+    earlier = {rate.task_id: rate.rate for rate in before}
+    pairs = ((earlier.get(rate.task_id), rate.rate) for rate in after)
+    return [later - first for first, later in pairs if first is not None and later is not None]
