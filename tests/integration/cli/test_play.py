@@ -9,6 +9,7 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from typer.testing import CliRunner
 
 from embomatrix.cli.play import play
+from embomatrix.starter.archive import unpack
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
@@ -102,6 +103,33 @@ def test_empty_plan_is_no_request_for_the_oracle(run):
     result = run("apple_to_counter", "--plan", "-", text="")
     assert result.exit_code == 1
     assert "no plan was found" in " ".join(result.output.split())
+
+
+def test_words_name_the_task_whose_instruction_is_most_like_them(run):
+    result = run("put the apple on the counter, please", "--plan", "-", text=json.dumps(GOOD))
+    printed = " ".join(result.output.split())
+    assert printed.startswith("the task most like these words, of ")
+    assert " apple_to_counter " in printed
+    assert "success" in printed
+
+
+def test_one_word_is_an_id(run):
+    result = run("apple", "--oracle")
+    assert result.exit_code == 2
+    assert "there is no task 'apple'" in " ".join(result.output.split())
+
+
+def test_shipped_policy_plays_a_shipped_task(tmp_path):
+    unpack(tmp_path)
+    app = typer.Typer()
+    app.command()(play)
+    words = "The apple is still on the countertop, but it belongs in the lunch box."
+    result = CliRunner().invoke(
+        app, [words, "--policy", "shipped", "--dataset", str(tmp_path)], env={"COLUMNS": "160"}
+    )
+    assert result.exit_code == 0, result.output
+    assert "put apple_1 inside lunch_box_1" in result.output
+    assert "success" in result.output
 
 
 def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
