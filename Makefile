@@ -10,7 +10,7 @@ ARGS ?=
 
 DEFAULT_TESTS := not slow and not docker and not hf and not eai and not peers
 
-.PHONY: run test test-unit test-slow test-random test-random-hour fuzz house lint types contracts proto proto-check check site diagrams compose-check pictures clean
+.PHONY: run test test-unit test-slow test-random test-random-hour fuzz house lint types contracts proto proto-check check site diagrams compose-check wheel pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
@@ -78,6 +78,11 @@ diagrams:
 compose-check: $(VENV)/.dev
 	deploy/docker/local_bases.sh
 	$(BIN)/python -m pytest -m docker $(ARGS)
+
+# Source distribution, and the wheel built from it, in build/dist. CONTRIBUTING.md lists the steps of a release.
+wheel: $(VENV)/.dev
+	rm -rf build/dist
+	$(BIN)/python -m build --no-isolation --outdir build/dist
 
 pictures: $(VENV)/.dev
 	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --out docs/pictures
