@@ -4,14 +4,11 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import typer
 from tests.fakes.scenes import kitchen_scene
 from typer.testing import CliRunner
 
-from embomatrix.cli.play import play
 from embomatrix.factory.admission import RefusalReason
 from embomatrix.factory.commands import app as cli
-from embomatrix.factory.commands import scenes as scene_cli
 from embomatrix.factory.task_import.reach import HELD
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportedTask, import_problem
@@ -77,14 +74,3 @@ def test_problem_on_the_page_is_imported_by_the_command_on_the_page(tmp_path, mo
     done = CliRunner().invoke(cli.app, arguments)
     assert done.exit_code == 0, done.output + done.stderr
     assert len(Dataset.load(arguments[arguments.index("--out") + 1]).records) == 1
-
-
-def test_commands_on_the_page_exist_with_their_options():
-    apps = {"factory": cli.app, "scene": scene_cli.app, "play": typer.Typer()}
-    apps["play"].command()(play)
-    for name, rest in re.findall(r"^embomatrix (\w+) (.*?)(?:#.*)?$", PAGE, re.MULTILINE):
-        command = typer.main.get_command(apps[name])
-        for word in rest.split()[:2]:
-            command = getattr(command, "commands", {}).get(word, command)
-        known = {option for parameter in command.params for option in parameter.opts}
-        assert set(re.findall(r"--[\w-]+", rest)) <= known, (name, rest)
