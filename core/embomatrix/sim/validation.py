@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Final
 
 from embomatrix.sim.engine import BACKGROUND, FLOOR, WALL, EngineError
-from embomatrix.sim.geometry.bounds import ASSETS_KEPT
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.codec import asset_from_json, asset_to_json
 from embomatrix.world.geometry import ConvexPart, Pose
@@ -15,6 +14,8 @@ from embomatrix.world.records import MAX_COORDINATE_M, UNIT_TOLERANCE, SceneInva
 from embomatrix.world.scene import Scene, SceneObject
 
 WALLS_KEPT: Final = 1024
+ASSETS_KEPT: Final = 512
+"""Walls and assets that passed and are remembered: more than a scene has."""
 
 
 def check_scene(scene: Scene) -> None:

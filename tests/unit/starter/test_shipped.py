@@ -1,4 +1,4 @@
-"""Which dataset a command uses, and where the shipped tasks are unpacked."""
+"""Choice of the dataset that a command uses, and unpacking of the shipped tasks."""
 
 from pathlib import Path
 
