@@ -3,12 +3,13 @@
 import os
 import subprocess
 import sys
-import sysconfig
 import zipfile
 from pathlib import Path
 
 import pytest
 from packaging.metadata import Metadata
+
+from embomatrix.bench.first_hour.wheel import install
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ("core", "proto", "manager", "worker", "trainer", "factory", "bench")
@@ -29,16 +30,8 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def environment(wheel, tmp_path_factory):
-    """Virtual environment with the wheel; its dependencies are those of the tests' environment, but not the clone."""
-    folder = tmp_path_factory.mktemp("environment")
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, timeout=120)
-    site = next((folder / "lib").glob("python*/site-packages"))
-    # Path files in this second folder are not read, so its editable installation of the clone is not seen.
-    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    install = [str(folder / "bin/pip"), "install", "--no-index", "--no-deps", str(wheel)]
-    done = subprocess.run(install, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    return folder
+    """Virtual environment with the wheel and the dependencies of the tests' environment, but not the clone."""
+    return install(wheel, tmp_path_factory.mktemp("environment"))
 
 
 def tracked_files():

@@ -138,6 +138,73 @@ def operations(
         hand_in(_measured("operations", lambda on_step: _operations(workload, on_step)), json_file)
 
 
+@app.command("first-hour")
+def first_hour(
+    json_file: Json = None,
+    seeds: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Seeds of `make run`, each with GRPO and with imitation that goes on for as long. 0: none.",
+        ),
+    ] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for the runs; finished ones are kept.")] = Path(
+        "build/first_hour"
+    ),
+    record: Annotated[
+        Path | None,
+        typer.Option(help="File for the seeds. Default: they are held against the recorded ones."),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps of GRPO, if not those of `make run`.")
+    ] = None,
+    imitate_steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps of imitation before GRPO, if not those of `make run`.")
+    ] = None,
+) -> None:
+    """Measure what a newcomer meets: the gain of `make run`, the wheel's first plan, and the trainer's image.
+
+    A seed takes about half an hour on two cores.
+    """
+    from embomatrix.bench.first_hour.record import comparison, figures_of, read_record, write_record
+    from embomatrix.bench.first_hour.seeds import run_seed
+    from embomatrix.bench.first_hour.wheel import measure_wheel
+
+    given = {"steps": steps, "imitate-steps": imitate_steps}
+    budget = {name: value for name, value in given.items() if value is not None}
+    known = {run.seed: run for run in read_record()}
+    notes: list[str] = []
+
+    def measure(on_step: OnStep) -> Sequence[Figure]:
+        runs = [run_seed(seed, out, budget, on_step) for seed in range(seeds)]
+        if record is not None:
+            write_record(record, runs)
+        notes.extend(comparison(known[run.seed], run) for run in runs if run.seed in known and not budget)
+        figures = list(figures_of(runs)) if runs else []
+        if Path("pyproject.toml").exists():
+            figures.append(measure_wheel(Path(), on_step))
+        else:
+            _note("wheel_first_plan_s is left out: it needs the checkout as working folder")
+        return [*figures, *_trainer_image()]
+
+    with refusals():
+        hand_in(_measured("first hour", measure), json_file)
+        for note in notes:
+            console.print(note, highlight=False)
+
+
+def _trainer_image() -> list[Figure]:
+    """Return the size of the trainer's image; none with a note if it is not built."""
+    from embomatrix.bench.operations.compose import compose_at, image_sizes, missing_images
+
+    if compose_at(Path()) is None or missing_images():
+        _note(
+            "image_trainer_mb is left out: it needs a Docker engine, the checkout, and `docker compose build`"
+        )
+        return []
+    return [figure for figure in image_sizes() if figure.name == "image_trainer_mb"]
+
+
 @app.command()
 def traffic(
     record: Annotated[

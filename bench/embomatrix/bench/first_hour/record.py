@@ -1,0 +1,128 @@
+"""Record of the demo's seeds: success by task, cost and learning curve of each, bound to dataset, code and machine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from pydantic import TypeAdapter
+
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.pages.figures import Better, Figure, Interval
+from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.world.whole_file import write_whole
+
+RECORD: Final = Path(__file__).parents[1] / "data" / "first_hour.json"
+"""Seeds that were recorded for the package."""
+LEAST_GAIN: Final = 0.08
+"""Goal of the smallest lower bound of the gain over imitation that goes on."""
+MOST_MINUTES: Final = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One training run. ``rates``: success by held-out task. ``core_s``: CPU seconds of all its processes."""
+
+    rates: Mapping[str, float]
+    imitation_steps: int
+    grpo_steps: int
+    wall_s: float
+    core_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SeedRun:
+    """Seed of the demo: with GRPO, and with imitation that goes on for as long. ``curve`` is a digest of GRPO's figures."""
+
+    seed: int
+    dataset: str
+    commit: str
+    platform: str
+    curve: str
+    imitated: Mapping[str, float]
+    trained: Arm
+    continued: Arm
+
+    @property
+    def gain(self) -> Interval:
+        """Success with GRPO minus success with continued imitation, paired by task, with its 95 % interval over tasks."""
+        pairs = [rate - self.continued.rates[task] for task, rate in self.trained.rates.items()]
+        return bootstrap(pairs)
+
+
+def write_record(path: Path, seeds: Sequence[SeedRun]) -> None:
+    """Write seeds in their order. Raise OSError."""
+    values = [asdict(seed) for seed in sorted(seeds, key=lambda each: each.seed)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, (json.dumps(values, indent=1) + "\n").encode("ascii"))
+
+
+def read_record(path: Path = RECORD) -> tuple[SeedRun, ...]:
+    """Read what `write_record` wrote; none if there is no file. Raise BenchError for any other content."""
+    if not path.exists():
+        return ()
+    try:
+        return TypeAdapter(tuple[SeedRun, ...]).validate_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise BenchError(
+            f"{path} is no record of the demo's seeds ({error}): remove it, and run `embomatrix bench first-hour --seeds 10`"
+        ) from error
+
+
+def figures_of(seeds: Sequence[SeedRun]) -> tuple[Figure, ...]:
+    """Return the smallest lower bound of the gain, success of each arm, and the longest time. Raise BenchError for none."""
+    if not seeds:
+        raise BenchError(
+            "no seed of the demo has run: expected at least one; run `embomatrix bench first-hour`"
+        )
+    count = len(seeds)
+    tasks = len(seeds[0].trained.rates)
+
+    def success(name: str, arms: Sequence[Mapping[str, float]]) -> Figure:
+        rates = [rate for arm in arms for rate in arm.values()]
+        return Figure(
+            f"demo_success {name}", 100 * sum(rates) / len(rates), "%", Better.NEITHER, count * tasks
+        )
+
+    return (
+        Figure(
+            "demo_gain_lower_min", min(seed.gain.low for seed in seeds), "", Better.HIGHER, count, LEAST_GAIN
+        ),
+        Figure("demo_gain", sum(seed.gain.value for seed in seeds) / count, "", Better.NEITHER, count),
+        success("after imitation", [seed.imitated for seed in seeds]),
+        success("imitation continued", [seed.continued.rates for seed in seeds]),
+        success("after GRPO", [seed.trained.rates for seed in seeds]),
+        Figure(
+            "demo_minutes",
+            max(seed.trained.wall_s for seed in seeds) / 60,
+            "min",
+            Better.LOWER,
+            count,
+            MOST_MINUTES,
+        ),
+        Figure(
+            "demo_core_minutes continued to trained",
+            min(seed.continued.core_s / seed.trained.core_s for seed in seeds),
+            "x",
+            Better.NEITHER,
+            count,
+        ),
+    )
+
+
+def comparison(recorded: SeedRun, repeated: SeedRun) -> str:
+    """Say in a sentence if a repeated seed is the recorded one."""
+    now, then = (
+        100 * sum(run.trained.rates.values()) / len(run.trained.rates) for run in (repeated, recorded)
+    )
+    figures = f"seed {repeated.seed}: success {now:.1f} % after GRPO, recorded {then:.1f} %"
+    if recorded.dataset != repeated.dataset:
+        return f"{figures}; the record is about other tasks ({recorded.dataset}, here {repeated.dataset})"
+    if recorded.curve == repeated.curve:
+        return f"{figures}; the learning curve is the recorded one, number by number"
+    if recorded.platform == repeated.platform:
+        return f"{figures}; the learning curve is another, on the same platform: the code changed since {recorded.commit}"
+    return f"{figures}; the platform is another ({recorded.platform}, here {repeated.platform}), so the curve may differ"

@@ -1,0 +1,113 @@
+"""Seeds of the demo, each in processes and a folder of its own: GRPO, and imitation that goes on for the same time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+
+from embomatrix.bench.first_hour.record import Arm, SeedRun
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.host.code_version import commit_here
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.lifecycle.stopwatch import Activity
+from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome
+from embomatrix.trainer.logging.recorder import read_metrics
+
+OnStep = Callable[[str], None]
+
+COST: Final = "cost.json"
+LOG: Final = "log.txt"
+TIMES: Final = frozenset({"seconds", "spent_s"})
+"""Figures of a step that no other run repeats."""
+
+
+def run_seed(seed: int, folder: Path, options: Mapping[str, int], on_step: OnStep) -> SeedRun:
+    """Run both arms of a seed, or read those that have finished. ``options`` are budgets for `embomatrix demo`.
+
+    Imitation goes on for as many steps as take the time of GRPO. Raise BenchError if a run fails.
+    """
+    trained = _arm(folder / f"seed-{seed}-grpo", seed, options, on_step)
+    outcome = read_outcome(trained)
+    further = round(outcome.imitation_steps * outcome.grpo_s / outcome.spent_s[Activity.IMITATION])
+    steps = {"imitate-steps": outcome.imitation_steps + further, "steps": 0}
+    continued = _arm(folder / f"seed-{seed}-imitation", seed, {**options, **steps}, on_step)
+    progress, _ = read_state(_newest(trained))
+    return SeedRun(
+        seed=seed,
+        dataset=progress.dataset,
+        commit=commit_here(),
+        platform=platform_here(),
+        curve=curve_digest(read_metrics(trained)),
+        imitated=_rates(outcome.before),
+        trained=_read_arm(trained, outcome),
+        continued=_read_arm(continued, read_outcome(continued)),
+    )
+
+
+def platform_here() -> str:
+    """Name what decides the rounding of numbers: processor family, Python and torch."""
+    return f"{platform.machine()}, Python {platform.python_version()}, torch {torch.__version__}"
+
+
+def curve_digest(metrics: list[dict[str, Any]]) -> str:
+    """Digest of the figures of all steps without their times."""
+    rows = [{name: value for name, value in row.items() if name not in TIMES} for row in metrics]
+    return hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _arm(out: Path, seed: int, options: Mapping[str, int], on_step: OnStep) -> Path:
+    """Run one arm, unless its outcome is there. An unfinished one starts anew."""
+    if (out / COST).exists():
+        return out
+    on_step(out.name)
+    shutil.rmtree(out, ignore_errors=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    log = out.with_suffix(f".{LOG}")
+    given = [f"--{name}={value}" for name, value in options.items()]
+    where = [f"--out={out}", f"--dataset={out.parent / 'dataset'}"]
+    began, spent = time.monotonic(), _children_s()
+    with log.open("wb") as file:
+        command = [sys.executable, "-m", "embomatrix.cli", "demo", f"--seed={seed}", *where, *given]
+        done = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, check=False)
+    if done.returncode or not (out / OUTCOME).exists():
+        raise BenchError(
+            f"the demo of seed {seed} ended with status {done.returncode}: read {log}, and run the command again"
+        )
+    cost = {"wall_s": time.monotonic() - began, "core_s": _children_s() - spent}
+    (out / COST).write_text(json.dumps(cost), encoding="ascii")
+    return out
+
+
+def _children_s() -> float:
+    """CPU seconds of all processes that ended below this one."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _read_arm(folder: Path, outcome: RunOutcome) -> Arm:
+    cost = json.loads((folder / COST).read_text(encoding="ascii"))
+    # Without GRPO, the evaluation after imitation is the last one.
+    rates = _rates(outcome.after or outcome.before)
+    return Arm(rates, outcome.imitation_steps, outcome.steps, cost["wall_s"], cost["core_s"])
+
+
+def _rates(rates: tuple[TaskRate, ...]) -> dict[str, float]:
+    return {rate.task_id: rate.rate for rate in rates if rate.rate is not None}
+
+
+def _newest(folder: Path) -> Path:
+    newest = CheckpointStore(folder / CHECKPOINTS, keep=1).latest()
+    if newest is None:
+        raise BenchError(f"{folder} has no checkpoint: remove it, and run the command again")
+    return newest

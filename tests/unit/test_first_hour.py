@@ -1,0 +1,73 @@
+"""Record of the demo's seeds: its figures, and how a repeated seed is held against it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from embomatrix.bench.first_hour.record import (
+    RECORD,
+    Arm,
+    SeedRun,
+    comparison,
+    figures_of,
+    read_record,
+    write_record,
+)
+from embomatrix.bench.first_hour.seeds import curve_digest
+from embomatrix.bench.report.figures import BenchError
+
+TASKS = [f"task-{number}" for number in range(20)]
+
+
+def arm(solved: int, wall_s: float = 60.0) -> Arm:
+    return Arm({task: float(at < solved) for at, task in enumerate(TASKS)}, 340, 420, wall_s, 2 * wall_s)
+
+
+def seed(number: int, solved: int, continued: int = 2) -> SeedRun:
+    return SeedRun(
+        number, "d1", "c1", "x86_64", f"curve-{number}", arm(1).rates, arm(solved, 600.0), arm(continued)
+    )
+
+
+def test_gain_is_paired_by_task_and_the_worst_seed_counts() -> None:
+    figures = {figure.name: figure for figure in figures_of([seed(0, 12), seed(1, 7)])}
+    assert figures["demo_gain"].value == pytest.approx(((12 - 2) + (7 - 2)) / 2 / 20)
+    assert figures["demo_gain_lower_min"].value == seed(1, 7).gain.low
+    assert figures["demo_gain_lower_min"].value < 0.25 < seed(0, 12).gain.low
+    assert figures["demo_success after GRPO"].value == pytest.approx(100 * (12 + 7) / 40)
+    assert figures["demo_minutes"].value == 10.0
+
+
+def test_no_seed_has_no_figures() -> None:
+    with pytest.raises(BenchError, match="no seed of the demo has run"):
+        figures_of([])
+
+
+def test_record_is_read_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "record.json"
+    write_record(path, [seed(1, 7), seed(0, 12)])
+    assert read_record(path) == (seed(0, 12), seed(1, 7))
+    assert read_record(tmp_path / "none.json") == ()
+    path.write_text('[{"seed": 0}]')
+    with pytest.raises(BenchError, match="is no record of the demo's seeds"):
+        read_record(path)
+
+
+def test_shipped_record_is_readable() -> None:
+    assert len(read_record(RECORD)) in (0, 10)
+
+
+def test_repeated_seed_is_held_against_the_record() -> None:
+    recorded = seed(0, 12)
+    assert "is the recorded one" in comparison(recorded, replace(recorded, commit="c2"))
+    assert "changed since c1" in comparison(recorded, replace(recorded, curve="other"))
+    assert "other tasks" in comparison(recorded, replace(recorded, dataset="d2"))
+    assert "platform is another" in comparison(recorded, replace(recorded, curve="other", platform="arm64"))
+
+
+def test_digest_of_a_curve_leaves_out_its_times() -> None:
+    row = {"step": 1, "reward": 0.25}
+    one, other = {**row, "seconds": 1.0, "spent_s": {"sampling": 1.0}}, {**row, "seconds": 2.0}
+    assert curve_digest([one]) == curve_digest([other])
+    assert curve_digest([one]) != curve_digest([{**one, "reward": 0.5}])
