@@ -25,7 +25,9 @@ from embomatrix.manager.web.rest import (
     only_known_parameters,
     read_routes,
 )
+from embomatrix.manager.web.rest_runs import run_routes
 from embomatrix.manager.web.rest_tasks import task_routes
+from embomatrix.manager.web.rest_workers import worker_routes
 from embomatrix.manager.web.rewards import reward_routes
 from embomatrix.rpc.versions import software_version
 
@@ -66,7 +68,9 @@ def build_api(
     snapshots = Snapshots(runtime)
     strictly = [Depends(only_known_parameters)]
     for routes in (
-        read_routes(runtime, snapshots),
+        read_routes(runtime, snapshots, rules.gate),
+        worker_routes(runtime, snapshots),
+        run_routes(runtime, snapshots),
         task_routes(gallery),
         command_routes(runtime, snapshots, revocation),
         reward_routes(runtime.runs),
