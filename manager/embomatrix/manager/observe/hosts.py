@@ -47,9 +47,11 @@ class _Host:
 
 
 class HostBook:
-    """Machines by worker. The manager's own secrets are masked in log lines too."""
+    """Machines by worker, at most ``hosts`` with ``lines`` in all. The manager's own secrets are masked in log lines too."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, hosts: int = HOSTS_KEPT, lines: int = ALL_LINES) -> None:
+        self._most_hosts = hosts
+        self._most_lines = lines
         self._hosts: OrderedDict[str, _Host] = OrderedDict()
         """The longest silent worker first."""
         self._lines = 0
@@ -100,15 +102,15 @@ class HostBook:
         return list(host.lines) if host is not None else []
 
     def _forget(self) -> None:
-        while len(self._hosts) > HOSTS_KEPT:
+        while len(self._hosts) > self._most_hosts:
             _, host = self._hosts.popitem(last=False)
             self._lines -= len(host.lines)
-        if self._lines > ALL_LINES:
+        if self._lines > self._most_lines:
             # The next heartbeats leave room for many lines before hosts are searched again.
             for host in self._hosts.values():
                 self._lines -= len(host.lines)
                 host.lines.clear()
-                if self._lines <= ALL_LINES * 9 // 10:
+                if self._lines <= self._most_lines * 9 // 10:
                     return
 
 

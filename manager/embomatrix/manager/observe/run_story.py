@@ -56,7 +56,12 @@ def _outcomes(summary: RunSummary) -> Iterator[str]:
     codes = Counter(event.code for event in summary.failures if event.code).most_common(1)
     if codes:
         code, count = codes[0]
-        yield f"Of the latest {_counted(len(summary.failures), 'failed attempt')}, {count} had the reason {code}."
+        kept = len(summary.failures)
+        yield (
+            f"One attempt failed, with the reason {code}."
+            if kept == 1
+            else f"Of the latest {kept:,} failed attempts, {count:,} had the reason {code}."
+        )
     if stats.redispatched:
         yield (
             f"{_counted(stats.redispatched, 'rollout')} went to another worker, because the first one left, failed "
@@ -87,7 +92,11 @@ def _scenes(summary: RunSummary) -> Iterator[str]:
     if not asked:
         return
     wasted = f"; {_counted(stats.prewarm_wasted, 'loaded scene')} had no use" if stats.prewarm_wasted else ""
-    yield f"{stats.prewarm_hits:,} of {_counted(asked, 'scene')} were loaded before their batch came{wasted}."
+    if asked == 1:
+        whether = "was" if stats.prewarm_hits else "was not"
+        yield f"Its scene {whether} loaded before the batch came{wasted}."
+    else:
+        yield f"{stats.prewarm_hits:,} of {asked:,} scenes were loaded before their batch came{wasted}."
 
 
 def _learning(training: TrainingDetail | None) -> Iterator[str]:

@@ -48,7 +48,7 @@ STATUSES: Final[Mapping[type[ClusterError], int]] = {
     PreconditionError: 409,
     UnavailableError: 503,
 }
-COMMANDS_NEED: Final = "a token of the role {role} may only read: commands need an admin's token"
+COMMANDS_NEED: Final = "A token of the role {role} may only read: commands need an admin's token."
 LOOK_S: Final = 0.5
 SILENCE_S: Final = 15.0
 """An idle stream sends a comment this often, so that proxies keep the connection open."""

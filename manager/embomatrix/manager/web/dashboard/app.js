@@ -7,6 +7,7 @@ import {learn} from "./names.js";
 const PAGES = {
   overview: () => import("./overview.js"), workers: () => import("./workers.js"), lookahead: () => import("./lookahead.js"), timeline: () => import("./timeline.js"),
   failures: () => import("./failures.js"), training: () => import("./training.js"), tasks: () => import("./tasks.js"),
+  runs: () => import("./runs.js"), rest: () => import("./rest.js"),
 };
 const REFRESH_MS = 1000;
 /** Rows of workers in the snapshot, by page; other pages need none. */
@@ -35,7 +36,7 @@ async function open() {
     if (link.getAttribute("href") === `#${name}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
-  document.title = `${name[0].toUpperCase()}${name.slice(1)} · EmboMatrix cluster`;
+  document.title = `${name === "rest" ? "REST" : name[0].toUpperCase() + name.slice(1)} · EmboMatrix cluster`;
   page.open(at("main"));
   await refresh(page.asksMore?.() ? null : first);
   // Load the other pages in the background, so that they open at once, even while the manager is away.
@@ -99,6 +100,7 @@ function showOverview(snapshot) {
 at("ask").addEventListener("submit", event => {
   event.preventDefault();
   sessionStorage.setItem("token", at("token").value);
+  delete at("ask").dataset.wanted;
   refresh();
 });
 // The URL's fragment names the page, so the skip link must not change it.

@@ -29,7 +29,7 @@ export async function show({runs}) {
   const known = runs.map(r => r.run_id);
   if (!run) run = (runs.findLast(r => r.pending || r.stats.delivered) ?? runs.at(-1))?.run_id ?? "";
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
-  if (!run) { put(at("tracks"), none("No open run. For a closed run: embomatrix cluster report RUN")); return; }
+  if (!run) { put(at("tracks"), none("No open run. Closed runs are on the page Runs.")); return; }
   if (!live && timeline) { draw(); return; } // the window or the theme may be another by now
   timeline = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
   if (live) {
