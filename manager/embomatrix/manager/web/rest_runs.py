@@ -52,7 +52,7 @@ def run_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
 
     @router.get("/runs/{run_id}/timeline", response_model=Timeline, summary="Work of each slot of a run")
     async def tracks(run_id: RunId, seconds: Seconds = 60.0, search: Search = "") -> Response:
-        """What each slot did in the last seconds of the run, on workers with the text in their name."""
+        """Work and idle time of each slot in the last seconds of the run, on workers with the text in their name."""
         latest = await history.latest(run_id, seconds)
         return json_response(timeline(run_id, latest, seconds=seconds, search=search))
 

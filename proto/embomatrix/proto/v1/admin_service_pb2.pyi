@@ -918,6 +918,8 @@ Global___KeptCurve: typing_extensions.TypeAlias = KeptCurve
 
 @typing.final
 class KeptPhase(google.protobuf.message.Message):
+    """Phase of an archived training: its steps and curves."""
+
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     PHASE_FIELD_NUMBER: builtins.int
