@@ -2,7 +2,7 @@
 import {ask} from "./ask.js";
 import {at, h, put} from "./dom.js";
 
-let known = null, owner = null;
+let known = null, owner = null, asking = null;
 
 /** Reason why this viewer may not send commands; empty if it may. */
 export const refusal = () => known?.refusal ?? "";
@@ -11,7 +11,8 @@ export const refusal = () => known?.refusal ?? "";
 export async function learnRole() {
   const token = sessionStorage.getItem("token") ?? "";
   if (known && owner === token) return;
-  known = await ask("caller");
+  asking ??= ask("caller").finally(() => { asking = null; });
+  known = await asking;
   owner = token;
 }
 

@@ -1,19 +1,20 @@
 // Runs by name, open and closed. Two of them can be compared; each has a page of its own.
 import {Refused, ask} from "./ask.js";
 import {asked, at, count, h, moment, none, put, seconds, table} from "./dom.js";
-import * as compared from "./compare.js";
-import * as one from "./run.js";
 
 const ROWS = 50, TYPING_MS = 250, LOOK_EVERY = 3;
 const STATES = [["all", "open and closed"], ["open", "open"], ["closed", "closed"]];
 const filters = {state: "all", search: "", offset: 0};
 let chosen = [], inner = null, typed = 0, looks = 0, page = null;
 
-export function open(main) {
+export async function open(main) {
   const ids = asked() ? asked().split("&").map(decodeURIComponent) : [];
-  inner = ids.length > 1 ? compared : ids.length ? one : null;
-  looks = 0; page = null;
-  if (inner) { inner.open(main, ...ids); return; }
+  inner = null; looks = 0; page = null;
+  if (ids.length) {
+    inner = await (ids.length > 1 ? import("./compare.js") : import("./run.js"));
+    inner.open(main, ...ids);
+    return;
+  }
   main.replaceChildren(h("section", {}, h("h2", {}, "Runs ", h("small", {id: "total"})),
     h("div", {class: "bar"},
       h("input", {type: "search", placeholder: "name or id", "aria-label": "search by name or id", value: filters.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),

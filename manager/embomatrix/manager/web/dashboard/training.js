@@ -38,7 +38,7 @@ export function close() {
 }
 
 export async function show({training}) {
-  if (!training.some(one => one.run_id === run) && run !== wanted) run = training[0]?.run_id ?? "";
+  if (!training.some(one => one.run_id === run) && (!run || run !== wanted)) run = training[0]?.run_id ?? "";
   if (!run && report) {  // another manager leads, and no trainer has reported to it yet
     close();
     open(at("main"));

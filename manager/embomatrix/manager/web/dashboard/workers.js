@@ -3,7 +3,6 @@ import {Refused, change} from "./ask.js";
 import {asked, at, count, gauge, h, none, put, seconds, share, table} from "./dom.js";
 import {named, worded} from "./names.js";
 import {command, learnRole, refusal, showRefusal} from "./role.js";
-import * as one from "./worker.js";
 
 const ROWS = 50, CHIPS = 6;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined", "left"];
@@ -15,9 +14,15 @@ export const query = () => filters;
 /** True if a filter or a later page is selected. */
 export const asksMore = () => Boolean(filters.state || filters.search || filters.offset);
 
-export function open(main) {
-  inner = asked() ? one : null;
-  if (inner) { inner.open(main, decodeURIComponent(asked())); return; }
+export async function open(main) {
+  inner = null;
+  learnRole().catch(() => {}); // the first refresh repeats the request
+  if (asked()) {
+    const name = decodeURIComponent(asked());
+    inner = await import("./worker.js");
+    inner.open(main, name);
+    return;
+  }
   const options = STATES.map(state => h("option", {value: state, selected: state === filters.state}, state || "all states"));
   main.replaceChildren(h("section", {},
     h("h2", {}, "Workers ", h("small", {id: "total"})),
