@@ -27,7 +27,7 @@ export function failureParts(events) {
   if (!events.length) return [none("None: every lease brought a result.")];
   const reasons = {};
   for (const {code} of events) reasons[code] = (reasons[code] ?? 0) + 1;
-  const counts = Object.entries(reasons).sort((a, b) => b[1] - a[1]).map(([code, n]) => `${count(n)} ${code}`).join(", ");
+  const counts = Object.entries(reasons).sort((a, b) => b[1] - a[1]).map(([code, n]) => events.length === 1 ? code : `${count(n)} ${code}`).join(", ");
   const rows = events.slice(-MESSAGES).reverse().map(event => h("tr", {}, h("td", {class: "muted fit"}, stamp(event.at_s)), h("td", {class: "fit"}, event.kind === "failed" ? "attempt" : "rollout"),
     h("td", {class: "fit"}, h("code", {class: "bad"}, event.code)), h("td", {class: "named"}, event.worker_id ?? ""), h("td", {class: "named"}, event.rollout_id ?? ""),
     h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "message"}, worded(event.message ?? ""))));

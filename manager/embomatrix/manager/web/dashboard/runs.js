@@ -1,6 +1,6 @@
 // Runs by name, open and closed. Two of them can be compared; each has a page of its own.
 import {Refused, ask} from "./ask.js";
-import {asked, at, count, h, moment, none, put, seconds, table} from "./dom.js";
+import {asked, at, count, decoded, h, moment, none, put, seconds, table} from "./dom.js";
 
 const ROWS = 50, TYPING_MS = 250, LOOK_EVERY = 3;
 const STATES = [["all", "open and closed"], ["open", "open"], ["closed", "closed"]];
@@ -8,7 +8,7 @@ const filters = {state: "all", search: "", offset: 0};
 let chosen = [], inner = null, typed = 0, looks = 0, page = null;
 
 export async function open(main) {
-  const ids = asked() ? asked().split("&").map(decodeURIComponent) : [];
+  const ids = asked() ? asked().split("&").map(decoded) : [];
   inner = null; looks = 0; page = null;
   if (ids.length) {
     inner = await (ids.length > 1 ? import("./compare.js") : import("./run.js"));

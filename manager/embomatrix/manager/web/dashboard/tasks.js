@@ -1,6 +1,6 @@
 // Tasks of the dataset: a gallery with pictures of their scenes, and a page for each task.
 import {Refused, ask, picture} from "./ask.js";
-import {at, categoryWords, count, counted, h, none, put, splitWords} from "./dom.js";
+import {at, categoryWords, count, counted, decoded, h, none, put, splitWords} from "./dom.js";
 import {drawn} from "./plan.js";
 import * as task from "./task.js";
 
@@ -12,7 +12,7 @@ export function open(main) {
   const chosen = location.hash.split("?")[1];
   if (chosen) {
     main.replaceChildren(h("section", {}, none("Loading the task…")));
-    task.open(main, decodeURIComponent(chosen)).catch(error => main.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), refused(error))));
+    task.open(main, decoded(chosen)).catch(error => main.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), refused(error))));
     return;
   }
   watcher = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(({target}) => { watcher.unobserve(target); look(target); }), {rootMargin: "200px"});

@@ -1,7 +1,7 @@
 // Training: reward by tier, success, zero-variance groups, time, and sampled plans with their results.
 import {Refused, ask} from "./ask.js";
 import {chart} from "./charts.js";
-import {at, categoryWords, clock, count, h, none, put, seconds, share, table} from "./dom.js";
+import {at, categoryWords, clock, count, decoded, h, none, put, seconds, share, table} from "./dom.js";
 import {sampledPlan} from "./parts.js";
 
 const CHARTS = [
@@ -19,7 +19,7 @@ let wanted = "";
 let run = "", seen = "", drawn = {}, report = null;
 
 export function open(main) {
-  run = wanted = decodeURIComponent(location.hash.split("?")[1] ?? "");
+  run = wanted = decoded(location.hash.split("?")[1] ?? "");
   seen = ""; drawn = {}; report = null;
   main.replaceChildren(
     h("section", {}, h("h2", {}, "Training ", h("small", {id: "when"})),

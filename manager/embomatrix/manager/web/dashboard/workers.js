@@ -1,6 +1,6 @@
 // Workers: scenes, slots, state, machine, and the commands drain and resume. Each has a page of its own.
 import {Refused, change} from "./ask.js";
-import {asked, at, count, gauge, h, none, put, seconds, share, table} from "./dom.js";
+import {asked, at, count, decoded, gauge, h, none, put, seconds, share, table} from "./dom.js";
 import {named, worded} from "./names.js";
 import {command, learnRole, refusal, showRefusal} from "./role.js";
 
@@ -18,7 +18,7 @@ export async function open(main) {
   inner = null;
   learnRole().catch(() => {}); // the first refresh repeats the request
   if (asked()) {
-    const name = decodeURIComponent(asked());
+    const name = decoded(asked());
     inner = await import("./worker.js");
     inner.open(main, name);
     return;
