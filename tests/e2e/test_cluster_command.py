@@ -71,8 +71,8 @@ async def test_report_and_trace_of_a_closed_run_show_its_rollouts(browser, kitch
         there = f"--manager={address}"
         assert "r1 evening closed" in (await cluster_command("runs", "--closed", there)).text
         assert (await cluster_command("report", "r1", f"--out={report}", there)).status == 0
-        assert (await cluster_command("trace", "r1", f"--out={trace}", there)).status == 0
-        lines = (await cluster_command("events", "r1", "--json", there)).text
+        assert (await cluster_command("trace", "evening", f"--out={trace}", there)).status == 0
+        lines = (await cluster_command("events", "evening", "--json", there)).text
         fleet = await cluster_command("events", there)
     page = shown(browser, report.as_uri(), tmp_path)
     assert page.words["about"].startswith("run r1 · opened 20")
@@ -104,6 +104,23 @@ async def test_unknown_run_or_worker_error_names_the_remedy(tmp_path):
         async with open_run(at.address):
             written = await cluster_command("report", "r1", f"--out={tmp_path / 'no' / 'r.html'}", there)
         assert (written.status, "can't be written" in written.text) == (2, True)
+
+
+async def test_reports_are_found_by_name_and_an_ambiguous_name_lists_the_ids(tmp_path):
+    async with manager(tmp_path) as at, ClusterClient(at.address) as client:
+        there = f"--manager={at.address}"
+        for run_id, name in (("r1", "morning"), ("r2", "evening"), ("r3", "evening"), ("evening", "night")):
+            await client.open_run(name, run_id)
+            if run_id != "r3":
+                await client.close_run(run_id)
+        named = await cluster_command("report", "morning", "--json", there)
+        assert json.loads(named.text)["run"]["run_id"] == "r1"
+        by_id = await cluster_command("report", "evening", "--json", there)
+        assert json.loads(by_id.text)["run"]["name"] == "night", "an id comes before a name"
+        await client.open_run("morning", "r4")
+        twice = await cluster_command("report", "morning", there)
+    assert twice.status == 2
+    assert "2 runs are named 'morning': pass the id of one, r4 or r1;" in twice.text
 
 
 async def test_operator_drains_and_resumes_a_worker_and_pauses_dispatch(tmp_path):

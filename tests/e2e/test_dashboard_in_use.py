@@ -13,7 +13,7 @@ from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.wire.values import LookaheadEntry
 
 SIZES = {"desk": (1366, 900), "phone": (390, 844)}
-PAGES = ("overview", "workers", "lookahead", "timeline", "failures", "training", "tasks")
+PAGES = ("overview", "workers", "lookahead", "timeline", "runs", "failures", "training", "tasks", "rest")
 SCRIPT = "<script>document.title = 'taken'</script>"
 LONG = "basement.with-a-rather-long-name-of-a-machine.lab.example.org"
 UNNAMED = """() => [...document.querySelectorAll("a, button, input, select, canvas, [role=img], [role=region]")]
@@ -55,8 +55,9 @@ class Window:
         page.on("request", lambda asked: asked.url.startswith(url) or self.wrong.append(asked.url))
 
     async def open(self, name):
+        """Open a page, or the part of one that follows a question mark."""
         await self.page.goto(f"{self.url}#{name}")
-        await self.page.locator(f'nav a[href="#{name}"][aria-current]').wait_for()
+        await self.page.locator(f'nav a[href="#{name.split("?")[0]}"][aria-current]').wait_for()
         await self.page.locator("#health:visible").wait_for()
 
     async def words(self, selector):
@@ -73,7 +74,7 @@ def _brief(digest):
 
 
 @contextlib.asynccontextmanager
-async def window(browser, url, *, size="desk", theme="light"):
+async def window(browser, url, *, size="desk", theme="light", token=""):
     playwright = pytest.importorskip("playwright.async_api")
     wide, high = SIZES[size]
     async with playwright.async_playwright() as driver:
@@ -81,6 +82,8 @@ async def window(browser, url, *, size="desk", theme="light"):
         viewport = {"width": wide, "height": high}
         page = await program.new_page(viewport=viewport, color_scheme=theme)
         page.set_default_timeout(20_000)
+        if token:
+            await page.add_init_script(f"sessionStorage.setItem('token', '{token}')")
         yield Window(page, url)
         await program.close()
 

@@ -15,6 +15,7 @@ from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 from embomatrix.rpc.wire.leases import LeaseResult, WorkerState
 from embomatrix.rpc.wire.session import (
+    host_use_to_proto,
     lease_from_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
@@ -24,6 +25,7 @@ from embomatrix.rpc.wire.session import (
 )
 from embomatrix.rpc.wire.values import (
     Completed,
+    HostUse,
     InfraCode,
     InfraFailure,
     Resident,
@@ -97,6 +99,10 @@ class FakeWorker:
     """True if prefixes of turns have other digests here, as on another platform."""
     resumed: bool = False
     labels: dict = field(default_factory=dict)
+    host: HostUse | None = None
+    """Use of its machine in every heartbeat."""
+    log_lines: list = field(default_factory=list)
+    """Lines of its log for the next heartbeat."""
 
     async def __aenter__(self):
         self._channel = open_channel(self.address, self.token, self.ca)
@@ -258,9 +264,14 @@ class FakeWorker:
         while True:
             await asyncio.sleep(interval_s)
             running = [lease_ref_to_proto(lease.ref) for lease in self.leases.values()]
+            lines, self.log_lines = self.log_lines, []
             await self._stub.Heartbeat(
                 pb.HeartbeatRequest(
-                    session_id=self.session[0], session_epoch=self.session[1], running=running
+                    session_id=self.session[0],
+                    session_epoch=self.session[1],
+                    running=running,
+                    host=host_use_to_proto(self.host) if self.host is not None else None,
+                    log_lines=lines,
                 ),
                 timeout=5,
             )

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import gzip
 import json
+import math
 import os
 import random
 from collections.abc import Callable, Iterator
@@ -199,6 +200,12 @@ def _archived() -> list[bytes]:
     kept = admin_service_pb2.KeptRun()
     kept.summary.run.run_id, kept.summary.series.step_s = "run-1", 1.0
     kept.events.add(sequence=1, at_s=1.0, kind=admin_service_pb2.EVENT_KIND_RUN_OPENED, run_id="run-1")
+    kept.training.phase, kept.training.step = "grpo", 2
+    phase = kept.training.phases.add(phase="grpo", steps=[1, 2])
+    phase.curves.add(name="reward", values=[1.0, math.nan])
+    kept.training.plans.add(task_id="t1", instruction="tidy up", text="move 3").steps.add(
+        skill="move", ok=True
+    )
     plain = kept.SerializeToString()
     return [plain, gzip.compress(plain)]
 
@@ -380,7 +387,7 @@ def table() -> dict[str, Decoder]:
             _archive,
             (),
             _archived,
-            frozenset({"manager.observe.run_archive:RunArchive._read"}),
+            frozenset({"manager.observe.run_archive:RunArchive._message"}),
             mutate_bytes,
         ),
         "manager settings": Decoder(

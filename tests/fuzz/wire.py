@@ -57,6 +57,8 @@ from embomatrix.rpc.wire.run_log import (
     run_summary_to_proto,
 )
 from embomatrix.rpc.wire.session import (
+    host_use_from_proto,
+    host_use_to_proto,
     lease_from_proto,
     lease_progress_from_proto,
     lease_ref_from_proto,
@@ -125,8 +127,10 @@ def _log_row(result: LeaseResult) -> None:
 
 
 def _heartbeat(message: worker_service_pb2.HeartbeatRequest) -> object:
-    return each("running", lease_ref_from_proto, message.running), each(
-        "progress", lease_progress_from_proto, message.progress
+    return (
+        each("running", lease_ref_from_proto, message.running),
+        each("progress", lease_progress_from_proto, message.progress),
+        inside("host", _again(host_use_from_proto, host_use_to_proto), message.host),
     )
 
 
@@ -275,6 +279,8 @@ def _sound() -> Mapping[str, list[Message]]:
     session.results.extend([result, failed])
     beat = worker_service_pb2.HeartbeatRequest(session_id="s-1", session_epoch=1, running=[ref], load=0.5)
     beat.progress.add(ref=ref, steps=2)
+    beat.host.cpu_share, beat.host.memory_mb = 0.5, 1024
+    beat.log_lines.append("2026-11-21 14:00:11.482Z INFO    registered")
     delivered = types_pb2.RolloutResult(rollout_id="r-1", group_id="g-1", cursor=1, attempt=1)
     delivered.completed.CopyFrom(result.completed)
     answer = rollout_service_pb2.ExecuteResponse(results=[delivered])

@@ -959,6 +959,10 @@ REQUESTS = (
         "'w9'",
         "check its name with `embomatrix cluster workers`",
     ),
+    RequestCase("unknown worker's page", "GET", "workers/w9", "'w9'", "it may have left"),
+    RequestCase("unknown worker's log", "GET", "workers/w9/log", "'w9'", "it may have left"),
+    RequestCase("unknown training", "GET", "training/r9", "'r9'", "those of archived runs"),
+    RequestCase("unknown state of runs", "GET", "runs?state=done", "state", "'open', 'closed' or 'all'"),
     RequestCase("unknown run", "GET", "runs/r9", "'r9'", "`embomatrix cluster runs --closed` lists"),
     RequestCase("no token", "GET", "workers", "missing or unknown token", "set EMBOMATRIX_TOKEN", token=""),
     RequestCase(

@@ -13,9 +13,11 @@ from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, mana
 
 from embomatrix.manager.web.rest import PREFIX, VIEWERS
 from embomatrix.rpc.admin_client import AdminClient
+from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import NotFoundError
+from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.rpc.wire.training import RewardTiers, SampledPlan, TrainingReport
-from embomatrix.rpc.wire.values import LookaheadEntry
+from embomatrix.rpc.wire.values import HostUse, LookaheadEntry
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -81,6 +83,15 @@ async def test_full_disk_is_reported_in_the_health_sentence(tmp_path):
         with no_file_grows(state.with_name(f"{state.name}-wal").stat().st_size):
             await _hear(client, "make room on its disk")
         await _hear(client, "No worker has joined yet")
+
+
+async def _line_shown(http, line):
+    """Wait until the worker's log ends with the line."""
+    async with asyncio.timeout(10):
+        while True:
+            if (await http.get(f"{PREFIX}/workers/w1/log")).json()["lines"][-1] == line:
+                return
+            await asyncio.sleep(0.05)
 
 
 async def _hear(client, words):
@@ -291,6 +302,18 @@ async def test_openapi_page_describes_every_answer(tmp_path):
             if "get" in methods and "{" not in path and not path.endswith("stream"):
                 assert (await http.get(path)).status_code == 200
     assert {"SnapshotPage", "WorkerPage", "Timeline", "Changed"} <= set(body["components"]["schemas"])
+    calls = [one for methods in body["paths"].values() for one in methods.values()]
+    groups = {tag["name"] for tag in body["tags"]}
+    for one in calls:
+        # FastAPI makes up a summary from the function's name: ours are sentences of words of the domain.
+        words = one["operationId"].split("_api_v1_")[0].replace("_", " ")
+        assert one["summary"].lower() != words, one["operationId"]
+        assert one["description"].endswith("."), one["operationId"]
+        assert set(one["tags"]) <= groups
+        assert all(parameter.get("description") for parameter in one.get("parameters", ())), one[
+            "operationId"
+        ]
+    assert len({one["summary"] for one in calls}) == len(calls)
 
 
 async def test_training_reports_are_shown_after_their_run_closed(tmp_path):
@@ -312,6 +335,95 @@ async def test_training_reports_are_shown_after_their_run_closed(tmp_path):
     assert later == body
     assert listed == seen["training"] == [body["run"]]
     assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
+
+
+async def test_closed_runs_are_listed_by_name_and_keep_story_plans_and_failures(tmp_path):
+    plan = SampledPlan("t1", "tidy up", "move 3", RewardTiers(0.5, 0.2, 15.0, False), 1.0)
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, broken={BEDROOM}),
+    ):
+        await client.report_training("r1", TrainingReport("grpo", 1, {"reward": 2.0}, (plan,)))
+        await outcomes(client, batch(8))
+        await outcomes(client, batch(1, batch_id="b2", scene=BEDROOM))
+        await client.close_run("r1")
+        await client.open_run("evening", "r2")
+    # Another manager of the same folder knows the run from its file alone.
+    async with manager(tmp_path) as at, ClusterClient(at.address) as client, http_at(at) as http:
+        await client.open_run("night", "r3")
+        lists = {
+            query: [run["run_id"] for run in (await http.get(f"{PREFIX}/runs?{query}")).json()["items"]]
+            for query in ("", "state=closed", "state=all", "state=all&search=TEST", "state=open&search=test")
+        }
+        body = (await http.get(f"{PREFIX}/runs/r1")).json()
+        training = (await http.get(f"{PREFIX}/training/r1")).json()
+        untrained = (await http.get(f"{PREFIX}/runs/r3")).json()
+        wrong = await http.get(f"{PREFIX}/runs?state=done")
+    assert lists == {
+        "": ["r3"],
+        "state=closed": ["r1"],
+        "state=all": ["r3", "r1"],
+        "state=all&search=TEST": ["r1"],
+        "state=open&search=test": [],
+    }
+    assert body["story"][0].startswith("The run test was open from ")
+    assert "1 worker completed 8 rollouts; 1 rollout ended in an infrastructure failure." in body["story"]
+    assert {total["name"]: total["value"] for total in body["totals"]}["completed rollouts"] == 8
+    assert body["failures"][-1]["code"] == "scene_load_failed"
+    assert "slot" not in body["failures"][-1], "fields that do not apply are left out"
+    assert (body["trained"], untrained["trained"]) == (True, False)
+    assert training["phases"] == [{"phase": "grpo", "steps": [1], "figures": {"reward": [2.0]}}]
+    assert training["plans"][0]["text"] == "move 3"
+    assert (wrong.status_code, wrong.json()["detail"][0]["loc"]) == (422, ["query", "state"])
+
+
+async def test_machine_and_log_of_a_worker_are_shown_without_secrets(tmp_path):
+    lines = ["registered with Bearer abc.def", "store redis://user:hidden@host is away"]
+    async with (
+        manager(tmp_path) as at,
+        http_at(at) as http,
+        FakeWorker(at.address, "w1", host=HostUse(0.25, 4000, 16_000), log_lines=lines) as worker,
+        FakeWorker(at.address, "old"),
+    ):
+        seen = await seen_until(http, lambda seen: any(row["host"] for row in seen["workers"]["items"]))
+        detail = (await http.get(f"{PREFIX}/workers/w1")).json()
+        log = (await http.get(f"{PREFIX}/workers/w1/log")).json()
+        old = [(await http.get(f"{PREFIX}/workers/old{path}")).json() for path in ("", "/log")]
+        unknown = [await http.get(f"{PREFIX}/workers/nobody{path}") for path in ("", "/log")]
+        worker.log_lines = ["one more"]
+        await _line_shown(http, "one more")
+    (row,) = [row for row in seen["workers"]["items"] if row["worker_id"] == "w1"]
+    assert row["host"] == {"cpu_share": 0.25, "memory_used_mb": 4000, "memory_mb": 16_000}
+    assert detail["worker"]["worker_id"] == "w1"
+    assert (detail["host"]["cpu_share"][0], detail["host"]["memory_used_mb"][0]) == (0.25, 4000)
+    assert detail["host"]["memory_mb"] == 16_000
+    assert log == {
+        "worker_id": "w1",
+        "lines": ["registered with Bearer ***", "store redis://user:***@host is away"],
+    }
+    assert (old[0]["worker"]["host"], old[0]["host"]["at_s"], old[1]["lines"]) == (None, [], [])
+    assert [answer.status_code for answer in unknown] == [404, 404]
+    assert "'nobody' (connected: old, w1)" in unknown[0].json()["detail"]
+
+
+async def test_caller_learns_its_role_and_why_it_may_not_send_commands(tmp_path):
+    async with manager(tmp_path, token="secret") as at:
+        async with AdminClient(at.address, "secret") as admin:
+            tokens = {
+                role: (await admin.issue_token(role))[0] for role in (AccessRole.VIEWER, AccessRole.TRAINER)
+            }
+        tokens[AccessRole.ADMIN] = "secret"
+        found = {}
+        for role, token in tokens.items():
+            async with http_at(at, authorization=f"Bearer {token}") as http:
+                found[role] = (await http.get(f"{PREFIX}/caller")).json()
+                paused = await http.post(f"{PREFIX}/dispatch/pause")
+                assert (paused.status_code == 200) is not bool(found[role]["refusal"]), role
+    assert {role: answer["role"] for role, answer in found.items()} == {role: role.value for role in tokens}
+    assert found[AccessRole.VIEWER]["refusal"].startswith("A token of the role viewer may only read")
+    async with manager(tmp_path / "open") as at, http_at(at) as http:
+        assert (await http.get(f"{PREFIX}/caller")).json() == {"role": "admin", "refusal": ""}
 
 
 async def test_tasks_need_a_viewer_token(tmp_path):

@@ -256,7 +256,7 @@ def _draw(film: Film, path: Path) -> None:
 
 
 def _show_task(task: Task) -> None:
-    console.print(f"[bold]{escape(task.task_id)}[/bold]  {task.category.value} in {escape(task.scene_id)}")
+    console.print(f"[bold]{escape(task.task_id)}[/bold]  {task.category.words} in {escape(task.scene_id)}")
     console.print(f"  {escape(task.instruction)}")
     console.print(f"  [dim]{escape(task.goal_bddl)}[/dim]\n")
 

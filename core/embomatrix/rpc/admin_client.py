@@ -14,7 +14,7 @@ from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
 from embomatrix.rpc.managers import FAILOVER_S, Managers
-from embomatrix.rpc.status import UnavailableError, cluster_errors
+from embomatrix.rpc.status import InvalidRequestError, UnavailableError, cluster_errors
 from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.run_log import (
     EventPage,
@@ -31,6 +31,8 @@ from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, WorkerInf
 
 CALL_S: Final = 10.0
 """Default time limit of one call."""
+NAMED: Final = 5
+"""Ids of runs of one name that a message lists at most."""
 PAUSE_S: Final = 0.2
 """Pause between calls to two managers."""
 P = ParamSpec("P")
@@ -128,6 +130,22 @@ class AdminClient:
         """Return the totals of an open or archived run. Raises NotFoundError."""
         answer = await self._admin.GetRun(pb.GetRunRequest(run_id=run_id), timeout=self._call_s)
         return inside("summary", run_summary_from_proto, answer)
+
+    async def find_run(self, run: str) -> str:
+        """Return the id of the run with this id or name; the text itself if there is none.
+
+        Raises InvalidRequestError if several runs have the name.
+        """
+        runs = (*await self.list_runs(), *await self.list_runs(closed=True))
+        if any(found.run_id == run for found in runs):
+            return run
+        named = list(dict.fromkeys(found.run_id for found in runs if found.name == run))
+        if len(named) > 1:
+            raise InvalidRequestError(
+                f"{len(named)} runs are named {run!r}: pass the id of one, {' or '.join(named[:NAMED])}; "
+                "`embomatrix cluster runs` and `runs --closed` show when each was open"
+            )
+        return named[0] if named else run
 
     @of_the_leader
     async def read_events(self, run_id: str = "", *, after: int = 0) -> EventPage:

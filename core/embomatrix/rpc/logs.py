@@ -7,11 +7,13 @@ adds an id to all later lines of a task.
 import contextvars
 import dataclasses
 import functools
+import itertools
 import json
 import logging
 import re
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
@@ -139,6 +141,32 @@ class _Window:
     begin_s: float
     passed: int = 0
     suppressed: int = 0
+
+
+class LogTail(logging.Handler):
+    """Latest lines of this process's own loggers from ``INFO`` on, without secrets and line breaks, numbered from 1."""
+
+    def __init__(self, *, kept: int, characters: int) -> None:
+        super().__init__(logging.INFO)
+        self._lines: deque[str] = deque(maxlen=kept)
+        self._characters = characters
+        self._total = 0
+        self.setFormatter(HumanFormatter())
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            line = printable(self.format(record))
+        except Exception:  # noqa: BLE001  # a line that can't be formatted is reported as all handlers do
+            self.handleError(record)
+            return
+        self._lines.append(line if len(line) <= self._characters else f"{line[: self._characters - 1]}…")
+        self._total += 1
+
+    def lines(self, after: int, most: int) -> tuple[tuple[str, ...], int]:
+        """Return the first lines with a number above ``after``, at most ``most``, and the number of the last of them."""
+        begin = max(after, self._total - len(self._lines))
+        found = tuple(itertools.islice(self._lines, begin - (self._total - len(self._lines)), None))[:most]
+        return found, begin + len(found)
 
 
 class JsonFormatter(logging.Formatter):

@@ -25,6 +25,11 @@ class TaskCategory(StrEnum):
     KITCHEN_OPERATION = "kitchen_operation"
     COMPOUND = "compound"
 
+    @property
+    def words(self) -> str:
+        """Name for people, the same on every page and in every report."""
+        return self.value.replace("_", " ")
+
 
 class Profile(StrEnum):
     """Skills that a task's plans may use: the paper's thirteen, or three more for cutting, cleaning and wetting."""

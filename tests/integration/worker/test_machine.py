@@ -11,6 +11,7 @@ from embomatrix.worker.host.machine import (
     NEVER_S,
     CpuTimes,
     HostMachine,
+    HostMeter,
     Owner,
     desktop_active_s,
     family_cpu_s,
@@ -110,3 +111,13 @@ def test_unsupported_preference_is_reported():
 def test_free_space_is_measured_at_the_nearest_existing_folder(tmp_path):
     assert free_disk_mb(tmp_path / "not" / "yet") == pytest.approx(free_disk_mb(tmp_path), rel=0.5)
     assert free_disk_mb(tmp_path) > 0
+
+
+def test_use_of_the_machine_is_between_nothing_and_everything():
+    meter = HostMeter()
+    end_s = time.monotonic() + 0.3
+    while time.monotonic() < end_s:
+        pass
+    use = meter.use()
+    assert 0.0 < use.cpu_share <= 1.0
+    assert 0 < use.memory_used_mb <= use.memory_mb

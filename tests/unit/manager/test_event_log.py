@@ -7,7 +7,7 @@ from tests.fakes.worker import completed
 from embomatrix.manager.control.commands import GiveLease
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.manager.observe.event_log import EVENTS_KEPT, LEAST_KEPT, RunEventLog
-from embomatrix.manager.observe.run_archive import RunArchive
+from embomatrix.manager.observe.run_archive import ArchivedRun, RunArchive
 from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef, LeaseResult
 from embomatrix.rpc.wire.run_log import EventKind, PhaseSummary, RunSeries, RunSummary
 from embomatrix.rpc.wire.values import (
@@ -133,13 +133,12 @@ def summary(run_id):
 def test_archive_keeps_the_latest_runs_and_skips_damaged_files(tmp_path):
     archive = RunArchive(tmp_path / "runs", kept=3)
     for number in range(5):
-        archive.keep(summary(f"r{number}"), log_of("r").page("r", 0).events)
-    assert [kept.run.run_id for kept in archive.summaries()] == ["r4", "r3", "r2"]
+        archive.keep(ArchivedRun(summary(f"r{number}"), log_of("r").page("r", 0).events))
+    assert [run.run_id for run in archive.infos()] == ["r4", "r3", "r2"]
     (tmp_path / "runs" / "r3.run.gz").write_bytes(b"no gzip")
-    assert [kept.run.run_id for kept in archive.summaries()] == ["r4", "r2"]
+    assert [run.run_id for run in archive.infos()] == ["r4", "r2"]
     assert archive.load("r3") is None
     assert archive.load("r0") is None
     assert archive.load("../runs/r4") is None
     assert archive.load("r4\0") is None
-    _, events = archive.load("r4")
-    assert [event.kind for event in events] == [EventKind.RUN_OPENED]
+    assert [event.kind for event in archive.load("r4").events] == [EventKind.RUN_OPENED]

@@ -1,6 +1,5 @@
 """Training curves in bounded memory."""
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,14 +10,13 @@ from embomatrix.manager.observe.training_reports import (
     Curves,
     TrainingBook,
 )
-from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.training import FIGURES, SampledPlan, TrainingReport
 
 PLAN = SampledPlan("task-1", "tidy up", "move 3", None, 0.0)
 
 
 def curves_of(book, run_id="r1"):
-    return {curves.phase: curves for curves in book.detail(run_id).phases}
+    return {curves.phase: curves for curves in book.find(run_id).phases}
 
 
 def test_repeated_step_merges_its_figures():
@@ -29,7 +27,7 @@ def test_repeated_step_merges_its_figures():
     curves = curves_of(book)["grpo"]
     assert curves.steps == [1, 2]
     assert curves.figures == {"reward": [1.5, 2.0], "spent_s/sampling": [None, 7.0]}
-    detail = book.detail("r1")
+    detail = book.find("r1")
     assert (detail.plans, detail.plans_step) == ([PLAN], 2)
     assert (detail.run.name, detail.run.step, detail.run.reported_s, detail.run.revision) == (
         "evening",
@@ -64,8 +62,7 @@ def test_longest_silent_run_is_dropped():
     book.note("new", "", TrainingReport("grpo", 1, {"reward": 0.0}), at_s=2.0)
     assert [view.run_id for view in book.views()][:2] == ["new", "r0"]
     assert len(book.views()) == RUNS_KEPT
-    with pytest.raises(NotFoundError, match="r1"):
-        book.detail("r1")
+    assert book.find("r1") is None
 
 
 reports = st.builds(

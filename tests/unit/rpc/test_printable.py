@@ -9,7 +9,7 @@ from rich.console import Console
 
 from embomatrix.cli.cluster.tables import run_table
 from embomatrix.host.printable import printable
-from embomatrix.rpc.logs import LINES, HumanFormatter, JsonFormatter, LineLimit
+from embomatrix.rpc.logs import LINES, HumanFormatter, JsonFormatter, LineLimit, LogTail, hide
 from embomatrix.rpc.wire.values import RunInfo, RunStats
 
 
@@ -59,3 +59,34 @@ def test_a_run_named_with_markup_and_escape_sequences_is_shown_as_text() -> None
     console.print(run_table([RunInfo("r1", "[/bold]\x1b[2J\nforged", RunStats(), 0)]))
     text = console.export_text()
     assert "[/bold]\\u001b[2J\\nforged" in text
+
+
+def test_log_tail_keeps_the_latest_lines_and_hands_each_out_once() -> None:
+    tail = LogTail(kept=3, characters=60)
+    assert tail.lines(0, 20) == ((), 0)
+    for number in range(5):
+        tail.handle(record("line=%s", number))
+    first, last = tail.lines(0, 2)
+    assert [line[-6:] for line in first] == ["line=2", "line=3"]
+    more, end = tail.lines(last, 20)
+    assert ([line[-6:] for line in more], end) == (["line=4"], 5)
+    assert tail.lines(end, 20) == ((), 5)
+
+
+def test_log_tail_masks_secrets_cuts_long_lines_and_leaves_debug_lines_out() -> None:
+    hide("the-credential-of-tail")
+    tail = LogTail(kept=3, characters=80)
+    logger = logging.getLogger("embomatrix.tail")
+    logger.addHandler(tail)
+    logger.setLevel(logging.DEBUG)
+    try:
+        logger.debug("not sent")
+        logger.info("joined with the-credential-of-tail")
+        logger.error("a\nb %s", "x" * 200)
+    finally:
+        logger.removeHandler(tail)
+    (joined, long), _ = tail.lines(0, 20)
+    assert joined.endswith("joined with ***")
+    assert len(long) == 80
+    assert long.endswith("…")
+    assert "\n" not in long

@@ -36,7 +36,7 @@ app = command_group(
 )
 
 Worker = Annotated[str, typer.Argument(help="Id of a worker, as `embomatrix cluster workers` shows it.")]
-Run = Annotated[str, typer.Argument(help="Id of a run, as `embomatrix cluster runs` shows it.")]
+Run = Annotated[str, typer.Argument(help="Id or name of a run, as `embomatrix cluster runs` shows it.")]
 Out = Annotated[Path | None, typer.Option(help="File to write.", show_default=False)]
 
 
@@ -65,19 +65,22 @@ async def runs(
 @manager_command("cluster")
 async def plan(
     client: AdminClient,
-    run: Annotated[str, typer.Argument(help="Show this run only.")] = "",
+    run: Annotated[str, typer.Argument(help="Show this run only, by its id or name.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """Show the look-ahead: scenes of each coming step, how warm they are, and on which workers."""
     nothing = "no look-ahead: no trainer has announced coming steps with AnnounceLookahead"
-    _list(await client.plan(run), plan_table, nothing, as_json)
+    cells = await client.plan(await client.find_run(run) if run else "")
+    _list(cells, plan_table, nothing, as_json)
 
 
 @app.command()
 @manager_command("cluster", until_interrupted=True)
 async def events(
     client: AdminClient,
-    run: Annotated[str, typer.Argument(help="Log of this run; else of workers and scenes.")] = "",
+    run: Annotated[
+        str, typer.Argument(help="Log of the run of this id or name; else of workers and scenes.")
+    ] = "",
     follow: Annotated[
         bool, typer.Option("--follow", help="Wait for further events until interrupted.")
     ] = False,
@@ -85,8 +88,9 @@ async def events(
 ) -> None:
     """Print the log of a run, or of the workers, one event per line."""
     console, after = Console(soft_wrap=True, highlight=False), 0
+    run_id = await client.find_run(run) if run else ""
     while True:
-        page = await client.read_events(run, after=after)
+        page = await client.read_events(run_id, after=after)
         for event in page.events:
             if as_json:
                 show_json(event_plain(event))
@@ -127,23 +131,27 @@ async def report(
     out: Out = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures instead.")] = False,
 ) -> None:
-    """Write the report of an open or closed run as one self-contained HTML file, RUN.html by default."""
-    summary = await client.run(run)
+    """Write the report of an open or closed run as one self-contained HTML file, ID.html by default."""
+    run_id = await client.find_run(run)
+    summary = await client.run(run_id)
     if as_json:
         show_json(summary)
         return
     from embomatrix.cli.cluster.report import report_page
 
-    _write(out or Path(f"{run}.html"), report_page(summary, await client.all_events(run)))
+    _write(out or Path(f"{run_id}.html"), report_page(summary, await client.all_events(run_id)))
 
 
 @app.command()
 @manager_command("cluster")
 async def trace(client: AdminClient, run: Run, out: Out = None) -> None:
-    """Write a run as a Chrome trace for https://ui.perfetto.dev, RUN.trace.json by default."""
-    summary = await client.run(run)
-    page = chrome_trace(await client.all_events(run), await client.all_events(), summary.run.name or run)
-    _write(out or Path(f"{run}.trace.json"), json.dumps(page, separators=(",", ":")))
+    """Write a run as a Chrome trace for https://ui.perfetto.dev, ID.trace.json by default."""
+    run_id = await client.find_run(run)
+    summary = await client.run(run_id)
+    page = chrome_trace(
+        await client.all_events(run_id), await client.all_events(), summary.run.name or run_id
+    )
+    _write(out or Path(f"{run_id}.trace.json"), json.dumps(page, separators=(",", ":")))
 
 
 @app.command()

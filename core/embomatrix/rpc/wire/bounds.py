@@ -28,6 +28,10 @@ NAME: Final = 256
 """Characters of an id or a digest."""
 SENTENCE: Final = 2_000
 """Characters of a text for people."""
+LOG_LINE: Final = 300
+"""Characters of a line of a worker's log."""
+LOG_LINES: Final = 20
+"""Lines of a worker's log in one heartbeat."""
 HELD_LEASES: Final = 4_096
 """Leases that a worker may hold, and unacknowledged results that it may keep."""
 RESULT_BYTES: Final = 64 * 1024
@@ -165,6 +169,10 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "HeartbeatRequest.load": _numbers(1e6),
     "HeartbeatRequest.memory_used_mb": _numbers(1e9),
     "HeartbeatRequest.progress": Bound(count=2 * HELD_LEASES),
+    "HeartbeatRequest.log_lines": Bound(length=LOG_LINE, count=LOG_LINES),
+    "HostUse.cpu_share": _numbers(1.0),
+    "HostUse.memory_used_mb": _numbers(1e9),
+    "HostUse.memory_mb": _numbers(1e9),
     "LeaseProgress.steps": _COUNT,
     "FetchBundleRequest.session_id": _ID,
     "FetchBundleRequest.bundle_digest": _ID,

@@ -40,6 +40,7 @@ from embomatrix.rpc.wire.run import (
 )
 from embomatrix.rpc.wire.values import (
     Completed,
+    HostUse,
     InfraFailure,
     PlanCell,
     Resident,
@@ -187,6 +188,7 @@ _LEASE_REF = (lease_ref_to_proto, lease_ref_from_proto)
 lease_progress_to_proto, lease_progress_from_proto = converters(
     LeaseProgress, worker_service_pb2.LeaseProgress, parts={"ref": _LEASE_REF}
 )
+host_use_to_proto, host_use_from_proto = converters(HostUse, worker_service_pb2.HostUse)
 worker_state_to_proto, worker_state_from_proto = converters(
     WorkerState,
     worker_service_pb2.WorkerState,

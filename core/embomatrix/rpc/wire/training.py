@@ -71,7 +71,7 @@ class TrainingReport:
 
 
 _step_to_proto, _step_from_proto = converters(SampledStep, pb.SampledStep)
-_plan_to_proto, _plan_from_proto = converters(
+sampled_plan_to_proto, _plan_from_proto = converters(
     SampledPlan,
     pb.SampledPlan,
     parts={
@@ -96,7 +96,7 @@ def training_report_to_proto(run_id: str, report: TrainingReport) -> pb.ReportTr
         phase=report.phase,
         step=report.step,
         figures=report.figures,
-        plans=[_plan_to_proto(_cut_plan(plan)) for plan in report.plans],
+        plans=[sampled_plan_to_proto(_cut_plan(plan)) for plan in report.plans],
     )
 
 
@@ -108,7 +108,7 @@ def training_report_from_proto(message: pb.ReportTrainingRequest) -> TrainingRep
         finite(f"figures[{name!r}]", value)
     phase = _bounded("phase", required("phase", message.phase), NAME_CHARS)
     return TrainingReport(
-        phase, message.step, dict(message.figures), each("plans", _checked_plan, message.plans)
+        phase, message.step, dict(message.figures), each("plans", sampled_plan_from_proto, message.plans)
     )
 
 
@@ -125,7 +125,8 @@ def _cut(value: SampledPlan | SampledStep, limits: Mapping[str, int]) -> dict[st
     }
 
 
-def _checked_plan(message: pb.SampledPlan) -> SampledPlan:
+def sampled_plan_from_proto(message: pb.SampledPlan) -> SampledPlan:
+    """Return the plan of a report or an archive. Raise ConvertError if a text or the list of steps is too long."""
     _bounded("steps", message.steps, MAX_STEPS)
     for name, limit in _PLAN_CHARS.items():
         _bounded(name, getattr(message, name), limit)

@@ -430,6 +430,15 @@ class FleetStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class HostUse:
+    """Use of a worker's machine by all its programs. ``cpu_share`` is the share of all cores, 0 to 1."""
+
+    cpu_share: float
+    memory_used_mb: int
+    memory_mb: int
+
+
+@dataclass(frozen=True, slots=True)
 class RunInfo:
     """Run with its counters; ``pending`` rollouts have no outcome yet.
 

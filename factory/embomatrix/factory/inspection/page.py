@@ -98,7 +98,7 @@ def _facts(record: TaskRecord) -> str:
     task = record.task
     found = {
         "scene": task.scene_id,
-        "category": task.category.value.replace("_", " "),
+        "category": task.category.words,
         "split": record.split,
         "source": task.source,
         "profile": task.profile.value,

@@ -10,6 +10,7 @@ import re
 import time
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -19,11 +20,14 @@ from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.dispatch.state import steps_of
 from embomatrix.manager.observe.event_log import PAGE, RunEventLog, RunRecord
 from embomatrix.manager.observe.run_figures import summary_of
+from embomatrix.manager.observe.training_archive import kept_training_from_proto, kept_training_to_proto
+from embomatrix.manager.observe.training_reports import RUNS_KEPT as TRAINED_KEPT
+from embomatrix.manager.observe.training_reports import TrainingBook, TrainingDetail
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.versions import software_version
-from embomatrix.rpc.wire.codec import ConvertError, each
+from embomatrix.rpc.wire.codec import ConvertError, each, inside
 from embomatrix.rpc.wire.run_log import (
     EventPage,
     PhaseSummary,
@@ -44,10 +48,13 @@ logger = logging.getLogger(__name__)
 class RunHistory:
     """History of open and closed runs. Reads the process's own clocks."""
 
-    def __init__(self, event_log: RunEventLog, archive: RunArchive, cluster: ClusterState) -> None:
+    def __init__(
+        self, event_log: RunEventLog, archive: RunArchive, cluster: ClusterState, training: TrainingBook
+    ) -> None:
         self._event_log = event_log
         self._archive = archive
         self._cluster = cluster
+        self._training = training
 
     def opened(self, run_id: str, name: str, reward: RewardSettings) -> None:
         logger.info("run opened run=%s: %s", run_id, name or "no name")
@@ -71,14 +78,15 @@ class RunHistory:
         if record is not None:
             info = self._info(record, stats, pending=0, closed_s=time.time())
             summary = self._summed(record, info, leads)
-            await asyncio.to_thread(self._archive.keep, summary, tuple(record.ring.events))
+            kept = ArchivedRun(summary, tuple(record.ring.events), self._training.copy_of(run_id))
+            await asyncio.to_thread(self._archive.keep, kept)
 
     async def summary(self, run_id: str) -> RunSummary:
         """Return the totals of an open or archived run. Raises NotFoundError."""
         record = self._event_log.runs.get(run_id)
         if record is not None:
             return self._summed(record, self.info(record), self.leads(run_id))
-        return (await self._archived(run_id))[0]
+        return (await self._archived(run_id)).summary
 
     def info(self, record: RunRecord) -> RunInfo:
         """Return the listing of an open run."""
@@ -87,7 +95,25 @@ class RunHistory:
 
     async def kept(self) -> list[RunInfo]:
         """Return the archived runs, the last closed first."""
-        return [summary.run for summary in await asyncio.to_thread(self._archive.summaries)]
+        return await asyncio.to_thread(self._archive.infos)
+
+    async def find_training(self, run_id: str) -> TrainingDetail | None:
+        """Return the training reports of an open or archived run; None without any."""
+        detail = self._training.find(run_id)
+        if detail is None and run_id not in self._event_log.runs:
+            kept = await asyncio.to_thread(self._archive.load, run_id)
+            return kept.training if kept is not None else None
+        return detail
+
+    async def training(self, run_id: str) -> TrainingDetail:
+        """Return the training reports of an open or archived run. Raises NotFoundError."""
+        detail = await self.find_training(run_id)
+        if detail is None:
+            raise NotFoundError(
+                f"no training of run {run_id!r} was reported to this manager: it keeps the latest {TRAINED_KEPT}, and "
+                "those of archived runs"
+            )
+        return detail
 
     async def events(self, run_id: str, after: int, limit: int) -> EventPage:
         """Return a page of the run's log, or of workers and scenes for an empty id. Raises NotFoundError."""
@@ -95,9 +121,9 @@ class RunHistory:
         page = self._event_log.page(run_id, after, limit)
         if page is not None:
             return page
-        summary, events = await self._archived(run_id)
-        beyond = [event for event in events if event.sequence > after]
-        return EventPage(tuple(beyond[:limit]), summary.events_dropped)
+        kept = await self._archived(run_id)
+        beyond = [event for event in kept.events if event.sequence > after]
+        return EventPage(tuple(beyond[:limit]), kept.summary.events_dropped)
 
     async def explain(self, rollout_id: str) -> RolloutExplanation:
         """Return the recent decisions about a rollout. Raises ``NotFoundError``."""
@@ -120,13 +146,13 @@ class RunHistory:
             events: Sequence[RunEvent] = record.ring.events
             dropped = record.ring.dropped
         else:
-            summary, events = await self._archived(run_id)
-            dropped = summary.events_dropped
+            kept = await self._archived(run_id)
+            events, dropped = kept.events, kept.summary.events_dropped
         since_s = events[-1].at_s - seconds if events else 0.0
         late = itertools.takewhile(lambda event: event.at_s >= since_s, reversed(events))
         return EventPage(tuple(late)[::-1], dropped)
 
-    async def _archived(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]]:
+    async def _archived(self, run_id: str) -> ArchivedRun:
         kept = await asyncio.to_thread(self._archive.load, run_id)
         if kept is None:
             raise NotFoundError(
@@ -174,6 +200,15 @@ RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 """Valid run ids. Each is also a safe file name."""
 
 
+@dataclass(frozen=True, slots=True)
+class ArchivedRun:
+    """Closed run: its totals, its latest events, and the reports of its trainer if it sent any."""
+
+    summary: RunSummary
+    events: tuple[RunEvent, ...]
+    training: TrainingDetail | None = None
+
+
 class RunArchive:
     """Folder with one file for each of the ``kept`` last closed runs.
 
@@ -183,10 +218,17 @@ class RunArchive:
     def __init__(self, folder: Path, *, kept: int = RUNS_KEPT) -> None:
         self._folder = folder
         self._kept = kept
+        self._infos: dict[str, tuple[int, RunInfo | None]] = {}
+        """Listing of each file by name, with the file's time of change: a list needs no second look at its events."""
 
-    def keep(self, summary: RunSummary, events: Sequence[RunEvent]) -> None:
+    def keep(self, kept: ArchivedRun) -> None:
         """Write a closed run. It replaces an earlier run of the same id."""
-        message = pb.KeptRun(summary=run_summary_to_proto(summary), events=map(run_event_to_proto, events))
+        summary = kept.summary
+        message = pb.KeptRun(
+            summary=run_summary_to_proto(summary), events=map(run_event_to_proto, kept.events)
+        )
+        if kept.training is not None:
+            message.training.CopyFrom(kept_training_to_proto(kept.training))
         path = self._path(summary.run.run_id)
         try:
             self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -197,12 +239,25 @@ class RunArchive:
         except OSError as error:
             logger.warning("run history not archived run=%s: %s", summary.run.run_id, error)
 
-    def summaries(self) -> list[RunSummary]:
-        """Return the archived runs, the last closed first."""
-        found = (self._read(path) for path in self._files())
-        return [entry[0] for entry in found if entry is not None]
+    def infos(self) -> list[RunInfo]:
+        """Return the listings of the archived runs, the last closed first."""
+        known, self._infos = self._infos, {}
+        found: list[RunInfo] = []
+        for path in self._files():
+            try:
+                changed_ns = path.stat().st_mtime_ns
+            except FileNotFoundError:
+                continue
+            entry = known.get(path.name)
+            if entry is None or entry[0] != changed_ns:
+                message = self._message(path)
+                entry = (changed_ns, None if message is None else self._info(path, message))
+            self._infos[path.name] = entry
+            if entry[1] is not None:
+                found.append(entry[1])
+        return found
 
-    def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
+    def load(self, run_id: str) -> ArchivedRun | None:
         """Return an archived run; None if there is none of that id."""
         # The id becomes a file name, so only valid run ids are accepted.
         return self._read(self._path(run_id)) if RUN_ID.fullmatch(run_id) else None
@@ -215,14 +270,38 @@ class RunArchive:
         found = self._folder.glob(f"*{SUFFIX}")
         return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
 
-    def _read(self, path: Path) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
+    def _read(self, path: Path) -> ArchivedRun | None:
+        message = self._message(path)
+        if message is None:
+            return None
         try:
-            message = pb.KeptRun.FromString(gzip.decompress(path.read_bytes()))
-            return run_summary_from_proto(message.summary), each(
-                "events", run_event_from_proto, message.events
-            )
+            summary = run_summary_from_proto(message.summary)
+            events = each("events", run_event_from_proto, message.events)
+            training = None
+            if message.HasField("training"):
+                run = summary.run
+                training = inside(
+                    "training",
+                    lambda kept: kept_training_from_proto(kept, run.run_id, run.name),
+                    message.training,
+                )
+        except ConvertError as error:
+            logger.warning("run history can't be read file=%s: %s", path.name, error)
+            return None
+        return ArchivedRun(summary, events, training)
+
+    def _info(self, path: Path, message: pb.KeptRun) -> RunInfo | None:
+        try:
+            return run_summary_from_proto(message.summary).run
+        except ConvertError as error:
+            logger.warning("run history can't be read file=%s: %s", path.name, error)
+            return None
+
+    def _message(self, path: Path) -> pb.KeptRun | None:
+        try:
+            return pb.KeptRun.FromString(gzip.decompress(path.read_bytes()))
         except FileNotFoundError:
             return None
-        except (OSError, EOFError, zlib.error, DecodeError, ConvertError) as error:
+        except (OSError, EOFError, zlib.error, DecodeError) as error:
             logger.warning("run history can't be read file=%s: %s", path.name, error)
             return None

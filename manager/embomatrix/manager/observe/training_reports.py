@@ -1,13 +1,12 @@
 """Training reports of the latest runs: learning curves and sampled plans, in bounded memory.
 
-They are not stored: after a restart the curves continue from the next report.
+Those of closed runs are archived. Those of open runs are not stored: after a restart the curves continue from the next report.
 """
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.training import FIGURES, PLANS, SampledPlan, TrainingReport
 
 RUNS_KEPT: Final = 16
@@ -78,13 +77,22 @@ class TrainingBook:
         """Return the runs, latest report first."""
         return [detail.run for detail in reversed(self._runs.values())]
 
-    def detail(self, run_id: str) -> TrainingDetail:
-        """Return all reports of a run, which later reports change. Raises NotFoundError."""
-        if run_id not in self._runs:
-            raise NotFoundError(
-                f"no training of run {run_id!r} was reported to this manager: the latest {RUNS_KEPT} are kept"
+    def find(self, run_id: str) -> TrainingDetail | None:
+        """Return all reports of a run, which later reports change; None if it has none, or none are left."""
+        return self._runs.get(run_id)
+
+    def copy_of(self, run_id: str) -> TrainingDetail | None:
+        """Return a copy that later reports do not change."""
+        detail = self._runs.get(run_id)
+        if detail is None:
+            return None
+        phases = [
+            Curves(
+                curves.phase, list(curves.steps), {name: list(row) for name, row in curves.figures.items()}
             )
-        return self._runs[run_id]
+            for curves in detail.phases
+        ]
+        return replace(detail, phases=phases, plans=list(detail.plans))
 
 
 def _add(curves: Curves, step: int, figures: Mapping[str, float]) -> None:

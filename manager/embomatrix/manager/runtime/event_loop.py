@@ -23,6 +23,7 @@ from embomatrix.manager.control.commands import (
 )
 from embomatrix.manager.control.events import Event, PauseChanged, WorkerFaulted
 from embomatrix.manager.observe.event_log import RunEventLog
+from embomatrix.manager.observe.hosts import HostBook
 from embomatrix.manager.observe.metrics import ErrorCount, ManagerLoad, Meter
 from embomatrix.manager.observe.run_archive import RunArchive, RunHistory
 from embomatrix.manager.observe.training_reports import TrainingBook
@@ -82,12 +83,13 @@ class ManagerRuntime:
         bundles.protect(cluster.needed_scenes)
         self.meter = Meter()
         self.training = TrainingBook()
+        self.hosts = HostBook()
         self.load = ManagerLoad()
         self.errors = ErrorCount()
         store = timed_store(store, self.load.operated)
         self.started_s = time.monotonic()
         self.event_log = RunEventLog(epoch_s=time.time() - self.started_s)
-        self.history = RunHistory(self.event_log, archive, cluster)
+        self.history = RunHistory(self.event_log, archive, cluster, self.training)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, self.history)
         self.turns = OpenTurns(self.runs, self._feed)
         self._intake = Intake(cluster, registry)
@@ -180,9 +182,18 @@ class ManagerRuntime:
 
     def process_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
         """Renew the leases that the worker names. Return the seconds until the next heartbeat."""
-        with self._fault_barrier(self.registry.find(session_id, epoch)):
+        session = self.registry.find(session_id, epoch)
+        with self._fault_barrier(session):
             interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
             self._carry_out(commands)
+            self.hosts.note(
+                session.worker_id,
+                session.boot_id,
+                session_id,
+                beat.host,
+                beat.log_lines,
+                at_s=time.time(),
+            )
         return interval_s
 
     def end_session(

@@ -19,7 +19,7 @@ from embomatrix.manager.control.events import (
     WorkerReported,
 )
 from embomatrix.rpc.wire.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
-from embomatrix.rpc.wire.values import Resources
+from embomatrix.rpc.wire.values import HostUse, Resources
 
 if TYPE_CHECKING:
     from embomatrix.manager.control.cluster_state import ClusterState
@@ -32,12 +32,16 @@ TICK_S: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """Heartbeat of a worker: the leases it holds, the progress of the running ones, and its load."""
+    """Heartbeat of a worker: the leases it holds, the progress of the running ones, its load, the use of its machine, and
+    new lines of its log.
+    """
 
     held: tuple[LeaseRef, ...]
     load: float = 0.0
     memory_mb: int = 0
     progress: tuple[LeaseProgress, ...] = ()
+    host: HostUse | None = None
+    log_lines: tuple[str, ...] = ()
 
 
 class Intake:

@@ -27,6 +27,7 @@ from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
 from embomatrix.rpc.wire.codec import each, inside
 from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.session import (
+    host_use_from_proto,
     lease_progress_from_proto,
     lease_ref_from_proto,
     lease_result_from_proto,
@@ -105,6 +106,8 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
                 request.load,
                 request.memory_used_mb,
                 each("progress", lease_progress_from_proto, request.progress),
+                inside("host", host_use_from_proto, request.host) if request.HasField("host") else None,
+                tuple(request.log_lines),
             ),
         )
         return pb.HeartbeatResponse(next_interval_s=interval_s)

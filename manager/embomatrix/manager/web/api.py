@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import TYPE_CHECKING, Final
 
 from fastapi import Depends, FastAPI, HTTPException, Response
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import Scope
@@ -25,7 +26,9 @@ from embomatrix.manager.web.rest import (
     only_known_parameters,
     read_routes,
 )
+from embomatrix.manager.web.rest_runs import run_routes
 from embomatrix.manager.web.rest_tasks import task_routes
+from embomatrix.manager.web.rest_workers import worker_routes
 from embomatrix.manager.web.rewards import reward_routes
 from embomatrix.rpc.versions import software_version
 
@@ -35,6 +38,15 @@ if TYPE_CHECKING:
 DASHBOARD: Final = str(files("embomatrix.manager.web") / "dashboard")
 COMPRESSED_BYTES: Final = 1024
 """Smaller answers fit one packet and are sent as they are."""
+TAGS: Final[Mapping[str, str]] = {
+    "cluster": "health, figures, look-ahead, and the log of workers and scenes; for viewers",
+    "runs": "open and closed runs, their timelines, and their training; for viewers",
+    "workers": "workers, their machines and their logs; for viewers",
+    "dataset": "tasks and scenes of the manager's dataset; for viewers",
+    "commands": "drain, resume, expel, pause; for admins",
+    "rewards": "rewards of answers; for trainers",
+}
+"""Groups of the API in the order of its page."""
 PAGE_HEADERS: Final[Mapping[str, str]] = {
     # The chart library sets inline styles on its own elements; everything else comes from this server's files.
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; connect-src 'self'; "
@@ -54,7 +66,9 @@ def build_api(
         title="EmboMatrix manager",
         version=software_version() or "source",
         description="State of the cluster, operator commands, and rewards. With tokens: `Authorization: Bearer TOKEN`.",
-        openapi_url=f"{PREFIX}/openapi.json",
+        # The route below makes the description in a thread, since the first time takes a tenth of a second of CPU.
+        openapi_url=None,
+        openapi_tags=[{"name": name, "description": text} for name, text in TAGS.items()],
         # FastAPI's own pages load scripts from other servers.
         docs_url=None,
         redoc_url=None,
@@ -66,7 +80,9 @@ def build_api(
     snapshots = Snapshots(runtime)
     strictly = [Depends(only_known_parameters)]
     for routes in (
-        read_routes(runtime, snapshots),
+        read_routes(runtime, snapshots, rules.gate),
+        worker_routes(runtime, snapshots),
+        run_routes(runtime, snapshots),
         task_routes(gallery),
         command_routes(runtime, snapshots, revocation),
         reward_routes(runtime.runs),
@@ -76,6 +92,10 @@ def build_api(
     @app.get("/", include_in_schema=False)
     async def index() -> FileResponse:
         return FileResponse(f"{DASHBOARD}/index.html", headers=dict(PAGE_HEADERS))
+
+    @app.get(f"{PREFIX}/openapi.json", include_in_schema=False)
+    async def description() -> JSONResponse:
+        return JSONResponse(await asyncio.to_thread(app.openapi))
 
     @app.get("/healthz", include_in_schema=False)
     async def health() -> dict[str, str]:

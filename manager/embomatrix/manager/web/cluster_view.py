@@ -17,7 +17,15 @@ from embomatrix.manager.runtime.event_loop import UNAUDITED, ManagerRuntime
 from embomatrix.manager.runtime.registry import WorkerSession, WorkerStanding
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.run_log import PhaseSummary
-from embomatrix.rpc.wire.values import PlanCell, Resident, ResidentState, RunInfo, Warmth, WorkerInfo
+from embomatrix.rpc.wire.values import (
+    HostUse,
+    PlanCell,
+    Resident,
+    ResidentState,
+    RunInfo,
+    Warmth,
+    WorkerInfo,
+)
 
 NO_WINDOW: Final = LookaheadWindow(0, ())
 PAGES_KEPT: Final = 64
@@ -115,6 +123,8 @@ class WorkerView:
     audit_mismatches: int = 0
     labels: dict[str, str] = field(default_factory=dict)
     """Labels of the owner, sorted by name."""
+    host: HostUse | None = None
+    """Use of its machine by all programs; None if it does not report it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +202,7 @@ def snapshot(runtime: ManagerRuntime) -> Snapshot:
         health=health(seen, paused=runtime.paused, now_s=now_s),
         paused=runtime.paused,
         overview=seen,
-        workers=[_worker(runtime, worker_id) for worker_id in sorted(runtime.registry.sessions)],
+        workers=[worker_view(runtime, worker_id) for worker_id in sorted(runtime.registry.sessions)],
         runs=run_infos(runtime),
         lookahead=_lookahead(runtime),
         training=runtime.training.views(),
@@ -258,7 +268,7 @@ def worker_infos(runtime: ManagerRuntime) -> list[WorkerInfo]:
     """Return all known workers for AdminService."""
     infos: list[WorkerInfo] = []
     for session in runtime.registry.sessions.values():
-        view = _worker(runtime, session.worker_id)
+        view = worker_view(runtime, session.worker_id)
         infos.append(
             WorkerInfo(
                 worker_id=view.worker_id,
@@ -297,7 +307,8 @@ def _standing(runtime: ManagerRuntime, session: WorkerSession) -> WorkerStanding
     return WorkerStanding.DRAINING if record is not None and record.draining else session.standing
 
 
-def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
+def worker_view(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
+    """Return one worker, which the registry knows."""
     session = runtime.registry.sessions[worker_id]
     record = runtime.cluster.dispatcher.workers.get(worker_id)
     scheduler = runtime.cluster.scheduler
@@ -325,6 +336,7 @@ def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
         residents=list(residents),
         loads=[scene for scene in scheduler.desired(worker_id) if scene not in here],
         labels=dict(sorted(session.resources.labels.items())),
+        host=runtime.hosts.use_of(worker_id),
     )
 
 

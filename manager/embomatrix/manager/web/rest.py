@@ -9,27 +9,24 @@ import dataclasses
 import functools
 import json
 from collections.abc import AsyncIterator, Iterator, Mapping
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
-from fastapi import APIRouter, Body, FastAPI, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Body, FastAPI, HTTPException, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
-from embomatrix.manager.observe.training_reports import TrainingDetail, TrainingView
+from embomatrix.manager.access.gate import Gate, the_token
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.revocation import Revocation
 from embomatrix.manager.web.cluster_view import LookaheadStep, Overview, Snapshots
 from embomatrix.manager.web.rest_values import (
     LARGEST_PAGE,
     PAGE,
+    CallerView,
     Changed,
-    RunPage,
+    EventList,
     SnapshotPage,
-    Timeline,
-    WorkerPage,
-    run_page,
+    event_fields,
     snapshot_page,
-    timeline,
-    worker_page,
 )
 from embomatrix.rpc.status import (
     ClusterError,
@@ -39,7 +36,7 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
-from embomatrix.rpc.wire.run_log import RunEvent
+from embomatrix.rpc.wire.tokens import AccessRole
 
 PREFIX: Final = "/api/v1"
 VIEWERS: Final = 256
@@ -51,10 +48,10 @@ STATUSES: Final[Mapping[type[ClusterError], int]] = {
     PreconditionError: 409,
     UnavailableError: 503,
 }
+COMMANDS_NEED: Final = "A token of the role {role} may only read: commands need an admin's token."
 LOOK_S: Final = 0.5
 SILENCE_S: Final = 15.0
 """An idle stream sends a comment this often, so that proxies keep the connection open."""
-LONGEST_S: Final = 3600.0
 
 Offset = Annotated[int, Query(ge=0, description="Rows to skip.")]
 Limit = Annotated[int, Query(ge=1, le=LARGEST_PAGE, description="Maximum number of rows.")]
@@ -65,7 +62,7 @@ Search = Annotated[
 ]
 Run = Annotated[str, Query(max_length=256, description="Run id; empty for the log of workers and scenes.")]
 After = Annotated[int, Query(ge=0, description="Only events with a higher sequence number.")]
-Seconds = Annotated[float, Query(gt=0, le=LONGEST_S, description="Length of the interval, in seconds.")]
+Worker = Annotated[str, Path(max_length=128, description="Name of the worker.", examples=["office-3"])]
 Reason = Annotated[
     str, Body(embed=True, min_length=1, max_length=200, description="Reason, which the worker's owner sees.")
 ]
@@ -83,75 +80,67 @@ async def only_known_parameters(request: Request) -> None:
             raise InvalidRequestError(f"{request.url.path} has no parameter {name[:64]!r}: {expected}")
 
 
-def read_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
+def read_routes(runtime: ManagerRuntime, snapshots: Snapshots, gate: Gate) -> APIRouter:
     """Return the routes of viewers."""
-    router = APIRouter(prefix=PREFIX, tags=["look"])
+    router = APIRouter(prefix=PREFIX, tags=["cluster"])
 
-    @router.get("/snapshot", response_model=SnapshotPage)
+    @router.get("/snapshot", response_model=SnapshotPage, summary="State of the whole cluster at one moment")
     async def snapshot(
         state: State = "", search: Search = "", offset: Offset = 0, limit: Limit = PAGE
     ) -> Response:
-        """State of the cluster at one moment: health, figures, a page of workers, runs, look-ahead, training."""
+        """All data of the dashboard's lists: health, figures, a page of workers, runs, look-ahead, training."""
         key = (state, search, offset, limit)
         text = snapshots.page(
             key, lambda seen: snapshot_page(seen, state=state, search=search, offset=offset, limit=limit)
         )
         return Response(text, media_type="application/json")
 
-    @router.get("/workers", response_model=WorkerPage)
-    async def workers(
-        state: State = "", search: Search = "", offset: Offset = 0, limit: Limit = PAGE
-    ) -> Response:
-        """Workers, those that need attention first."""
-        return json_response(
-            worker_page(snapshots.now(), state=state, search=search, offset=offset, limit=limit)
-        )
-
-    @router.get("/runs", response_model=RunPage)
-    async def runs(offset: Offset = 0, limit: Limit = PAGE) -> Response:
-        """Open runs, newest first."""
-        return json_response(run_page(snapshots.now(), offset=offset, limit=limit))
+    @router.get("/caller", response_model=CallerView, summary="Role of your token")
+    async def caller(request: Request) -> Response:
+        """Role of the token that the request carries, and the reason why it may not send commands, if it may not."""
+        role = gate.caller(the_token(request.headers.getlist("authorization"))).role
+        refusal = "" if role is AccessRole.ADMIN else COMMANDS_NEED.format(role=role)
+        return json_response(CallerView(role, refusal))
 
     _figures(router, snapshots)
     _logs(router, runtime)
-    _training(router, runtime, snapshots)
     _stream(router, runtime)
     return router
 
 
 def command_routes(runtime: ManagerRuntime, snapshots: Snapshots, revocation: Revocation) -> APIRouter:
     """Return the routes of admins."""
-    router = APIRouter(prefix=PREFIX, tags=["steer"])
+    router = APIRouter(prefix=PREFIX, tags=["commands"])
 
-    @router.post("/workers/{worker_id}/drain", response_model=Changed)
-    async def drain(worker_id: str) -> Changed:
+    @router.post("/workers/{worker_id}/drain", response_model=Changed, summary="Drain a worker")
+    async def drain(worker_id: Worker) -> Changed:
         """Let a worker finish its leases, and give it no new ones."""
         with _changing(snapshots):
             runtime.drain_worker(worker_id)
         return Changed(worker_id, "draining")
 
-    @router.post("/workers/{worker_id}/resume", response_model=Changed)
-    async def resume(worker_id: str) -> Changed:
+    @router.post("/workers/{worker_id}/resume", response_model=Changed, summary="Resume a worker")
+    async def resume(worker_id: Worker) -> Changed:
         """Cancel the drain, or lift the quarantine, of a worker that has not left."""
         with _changing(snapshots):
             runtime.resume_worker(worker_id)
         return Changed(worker_id, "ready")
 
-    @router.post("/workers/{worker_id}/revoke", response_model=Changed)
-    async def revoke(worker_id: str, reason: Reason) -> Changed:
+    @router.post("/workers/{worker_id}/revoke", response_model=Changed, summary="Expel a worker")
+    async def revoke(worker_id: Worker, reason: Reason) -> Changed:
         """Revoke a worker's credential and end its session. Its leases go to other workers."""
         with _changing(snapshots):
             await revocation.revoke_worker(worker_id, reason)
         return Changed(worker_id, "revoked")
 
-    @router.post("/dispatch/pause", response_model=Changed)
+    @router.post("/dispatch/pause", response_model=Changed, summary="Pause dispatch")
     async def pause() -> Changed:
         """Stop giving leases. Live leases continue."""
         with _changing(snapshots):
             await runtime.set_paused(True)
         return Changed("dispatch", "paused")
 
-    @router.post("/dispatch/resume", response_model=Changed)
+    @router.post("/dispatch/resume", response_model=Changed, summary="Resume dispatch")
     async def go_on() -> Changed:
         """Give leases again."""
         with _changing(snapshots):
@@ -162,56 +151,29 @@ def command_routes(runtime: ManagerRuntime, snapshots: Snapshots, revocation: Re
 
 
 def _figures(router: APIRouter, snapshots: Snapshots) -> None:
-    @router.get("/overview", response_model=Overview)
+    @router.get("/overview", response_model=Overview, summary="Figures of the cluster")
     async def overview() -> Response:
-        """Figures of the cluster."""
+        """Throughput, latency and its phases, queue, prewarming, outcomes and latest failures, without any lists."""
         return json_response(snapshots.now().overview)
 
-    @router.get("/lookahead", response_model=list[LookaheadStep])
+    @router.get("/lookahead", response_model=list[LookaheadStep], summary="Scenes that coming steps need")
     async def lookahead() -> Response:
-        """Scenes that coming steps need, with the loading state of each."""
+        """Steps that trainers announced, with the number of rollouts and the loading state of each scene."""
         return json_response(snapshots.now().lookahead)
 
 
 def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
-    history = runtime.history
-
-    @router.get("/runs/{run_id}")
-    async def run(run_id: str) -> Response:
-        """Totals of an open run, or of one of the last 50 closed runs."""
-        summary = await history.summary(run_id)
-        values = dataclasses.asdict(dataclasses.replace(summary, failures=()))
-        return JSONResponse({**values, "failures": [_event(event) for event in summary.failures]})
-
-    @router.get("/runs/{run_id}/timeline", response_model=Timeline)
-    async def tracks(run_id: str, seconds: Seconds = 60.0, search: Search = "") -> Response:
-        """Work of each slot in the last seconds of a run, on workers with the text in their name."""
-        latest = await history.latest(run_id, seconds)
-        return json_response(timeline(run_id, latest, seconds=seconds, search=search))
-
-    @router.get("/events")
+    @router.get("/events", response_model=EventList, summary="Events of a run, or of workers and scenes")
     async def events(run: Run = "", after: After = 0) -> Response:
-        """Page of the log of a run, or of workers and scenes."""
-        page = await history.events(run, after, 0)
-        return JSONResponse({"events": [_event(event) for event in page.events], "dropped": page.dropped})
-
-
-def _training(router: APIRouter, runtime: ManagerRuntime, snapshots: Snapshots) -> None:
-    @router.get("/training", response_model=list[TrainingView])
-    async def reporting() -> Response:
-        """Runs whose trainers report, latest report first. Includes some closed runs."""
-        return json_response(snapshots.now().training)
-
-    @router.get("/training/{run_id}", response_model=TrainingDetail)
-    async def detail(run_id: str) -> Response:
-        """Learning curves of a run, and recent plans of its policy."""
-        return json_response(runtime.training.detail(run_id))
+        """Page of a log, oldest event first. Ask again with the last sequence number for the next page."""
+        page = await runtime.history.events(run, after, 0)
+        return JSONResponse({"events": list(map(event_fields, page.events)), "dropped": page.dropped})
 
 
 def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:
     viewers = 0
 
-    @router.get("/events/stream", response_class=StreamingResponse)
+    @router.get("/events/stream", response_class=StreamingResponse, summary="New events as they happen")
     async def stream(run: Run = "", after: After = 0) -> Response:
         """New events as server-sent events: `id` is the sequence number, `data` the event as JSON."""
         nonlocal viewers
@@ -243,19 +205,12 @@ async def _growing(runtime: ManagerRuntime, run: str, after: int) -> AsyncIterat
             return
         for event in page.events:
             after = event.sequence
-            yield f"id: {after}\ndata: {json.dumps(_event(event))}\n\n"
+            yield f"id: {after}\ndata: {json.dumps(event_fields(event))}\n\n"
         silent_s = 0.0 if page.events else silent_s + LOOK_S
         if silent_s >= SILENCE_S:
             silent_s = 0.0
             yield ": nothing new\n\n"
         await asyncio.sleep(LOOK_S)
-
-
-def _event(event: RunEvent) -> dict[str, Any]:
-    """Return the event's fields that are set."""
-    timings = dataclasses.asdict(event.timings) if event.timings is not None else None
-    values = event._replace(timings=None)._asdict() | {"timings": timings}
-    return {name: value for name, value in values.items() if value}
 
 
 def json_response(value: object) -> Response:

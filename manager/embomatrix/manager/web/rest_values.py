@@ -3,14 +3,30 @@
 FastAPI evaluates the annotations for the OpenAPI page, so this module has no postponed annotations.
 """
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from enum import StrEnum
+from typing import Any, Final
 
-from embomatrix.manager.observe.training_reports import TrainingView
+from embomatrix.manager.observe.hosts import HostCurve
+from embomatrix.manager.observe.run_story import run_story
+from embomatrix.manager.observe.run_totals import RunTotal, run_totals
+from embomatrix.manager.observe.training_reports import TrainingDetail, TrainingView
 from embomatrix.manager.web.cluster_view import Health, LookaheadStep, Overview, Snapshot, WorkerView
 from embomatrix.rpc.timeline import Span, slot_spans
-from embomatrix.rpc.wire.run_log import EventPage
-from embomatrix.rpc.wire.values import RunInfo
+from embomatrix.rpc.wire.run_log import (
+    EventKind,
+    EventPage,
+    PhaseSummary,
+    RolloutPhase,
+    RunEvent,
+    RunSeries,
+    RunSummary,
+    RunWorker,
+)
+from embomatrix.rpc.wire.tokens import AccessRole
+from embomatrix.rpc.wire.values import RunInfo, Timings
 
 PAGE: Final = 100
 """Default number of rows on a page."""
@@ -39,6 +55,92 @@ class RunPage:
     total: int
     offset: int
     items: list[RunInfo]
+
+
+class RunFilter(StrEnum):
+    """Runs of a list."""
+
+    OPEN = "open"
+    CLOSED = "closed"
+    ALL = "all"
+
+
+@dataclass(frozen=True, slots=True)
+class EventView:
+    """Event of a log. A response has the fields that apply, and no others."""
+
+    sequence: int
+    at_s: float
+    kind: EventKind
+    run_id: str = ""
+    batch_id: str = ""
+    rollout_id: str = ""
+    worker_id: str = ""
+    bundle_digest: str = ""
+    slot: int = 0
+    attempt: int = 0
+    code: str = ""
+    message: str = ""
+    timings: Timings | None = None
+    held_s: float = 0.0
+    size: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class EventList:
+    """Page of a log. ``dropped`` events were discarded for later ones."""
+
+    events: list[EventView]
+    dropped: int
+
+
+@dataclass(frozen=True, slots=True)
+class RunDetail:
+    """Open or closed run: its story in sentences, totals, durations by phase, work of each worker, and latest failures."""
+
+    run: RunInfo
+    story: list[str]
+    totals: list[RunTotal]
+    phases: dict[RolloutPhase, PhaseSummary]
+    workers: list[RunWorker]
+    series: RunSeries
+    failures: list[EventView]
+    """Latest failed leases and rollouts, oldest first."""
+    manager_cpu_s: float
+    """CPU time of the manager while the run was open, spent on all runs."""
+    prewarm_lead: PhaseSummary
+    """Time between a scene being warm and its demand."""
+    scene_load: PhaseSummary
+    events_dropped: int
+    version: str
+    """Version of the manager's software."""
+    trained: bool
+    """True if its trainer reported: ``training/RUN`` has curves and plans."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerDetail:
+    """One worker, with the last half hour of its machine."""
+
+    at_s: float
+    worker: WorkerView
+    host: HostCurve
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerLog:
+    """Latest lines of a worker's log, oldest first, without secrets."""
+
+    worker_id: str
+    lines: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class CallerView:
+    """Role of the sender's token. ``refusal`` says why it may not send commands; empty if it may."""
+
+    role: AccessRole
+    refusal: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +214,47 @@ def worker_page(
     return WorkerPage(seen.at_s, len(found), offset, found[offset : offset + limit])
 
 
-def run_page(seen: Snapshot, *, offset: int = 0, limit: int = PAGE) -> RunPage:
-    """Return a page of the open runs, newest first."""
-    newest = seen.runs[::-1]
-    return RunPage(seen.at_s, len(newest), offset, newest[offset : offset + limit])
+def run_page(
+    seen: Snapshot,
+    closed: Sequence[RunInfo] = (),
+    *,
+    shown: RunFilter = RunFilter.OPEN,
+    search: str = "",
+    offset: int = 0,
+    limit: int = PAGE,
+) -> RunPage:
+    """Return a page of runs with the text in their name or id: open ones, the newest first, then closed ones."""
+    found = [] if shown is RunFilter.CLOSED else seen.runs[::-1]
+    open_ids = {run.run_id for run in seen.runs}
+    if shown is not RunFilter.OPEN:
+        # A run that was closed and opened again is open.
+        found = [*found, *(run for run in closed if run.run_id not in open_ids)]
+    found = [run for run in found if search.lower() in f"{run.name} {run.run_id}".lower()]
+    return RunPage(seen.at_s, len(found), offset, found[offset : offset + limit])
+
+
+def run_detail(summary: RunSummary, training: TrainingDetail | None) -> dict[str, Any]:
+    """Return the fields of a ``RunDetail``, each event with the fields that apply."""
+    values = {
+        field.name: getattr(summary, field.name)
+        for field in dataclasses.fields(summary)
+        if field.name != "failures"
+    }
+    return {
+        "run": summary.run,
+        "story": run_story(summary, training),
+        "totals": run_totals(summary, training),
+        **values,
+        "failures": [event_fields(event) for event in summary.failures],
+        "trained": training is not None,
+    }
+
+
+def event_fields(event: RunEvent) -> dict[str, Any]:
+    """Return the event's fields that are set."""
+    timings = dataclasses.asdict(event.timings) if event.timings is not None else None
+    values = event._replace(timings=None)._asdict() | {"timings": timings}
+    return {name: value for name, value in values.items() if value}
 
 
 def _words(worker: WorkerView) -> str:

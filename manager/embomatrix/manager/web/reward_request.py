@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -9,6 +10,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from embomatrix.rpc.status import InvalidRequestError
 
 MOST_ANSWERS: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class RewardAnswer:
+    """Rewards in the order of the answers. A score is 1 for a success, else 0."""
+
+    rewards: list[float]
+    scores: list[float]
+    extra_logs: dict[str, list[float]]
+    """Rewards by tier: format, relevance and goal."""
 
 
 class RewardRequest(BaseModel):

@@ -18,7 +18,7 @@ from embomatrix.manager.runtime.runs import Runs
 from embomatrix.manager.web.bodies import BodyBudget
 from embomatrix.manager.web.parsing import Answer, AnswerParser
 from embomatrix.manager.web.rest import PREFIX
-from embomatrix.manager.web.reward_request import RewardRequest
+from embomatrix.manager.web.reward_request import RewardAnswer, RewardRequest
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import unparsable
@@ -35,10 +35,15 @@ LONGEST_S: Final = 170.0
 
 def reward_routes(runs: Runs) -> APIRouter:
     """Return the routes of trainers."""
-    router = APIRouter(prefix=PREFIX, tags=["train"])
+    router = APIRouter(prefix=PREFIX, tags=["rewards"])
     bodies, parser = BodyBudget(), AnswerParser()
 
-    @router.post("/rewards", openapi_extra={"requestBody": _BODY})
+    @router.post(
+        "/rewards",
+        summary="Rewards of answers",
+        response_model=RewardAnswer,
+        openapi_extra={"requestBody": _BODY},
+    )
     async def rewards(request: Request) -> JSONResponse:
         """Reward, success (as score) and tiers of each answer; 503 after an infrastructure failure."""
         body = await bodies.receive(request)

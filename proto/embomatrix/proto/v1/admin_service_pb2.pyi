@@ -896,6 +896,88 @@ class GetRunResponse(google.protobuf.message.Message):
 Global___GetRunResponse: typing_extensions.TypeAlias = GetRunResponse
 
 @typing.final
+class KeptCurve(google.protobuf.message.Message):
+    """One figure of a training phase: a value for each step, NaN for a step without it."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: builtins.int
+    VALUES_FIELD_NUMBER: builtins.int
+    name: builtins.str
+    @property
+    def values(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]: ...
+    def __init__(
+        self,
+        *,
+        name: builtins.str = ...,
+        values: collections.abc.Iterable[builtins.float] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["name", b"name", "values", b"values"]) -> None: ...
+
+Global___KeptCurve: typing_extensions.TypeAlias = KeptCurve
+
+@typing.final
+class KeptPhase(google.protobuf.message.Message):
+    """Phase of an archived training: its steps and curves."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    PHASE_FIELD_NUMBER: builtins.int
+    STEPS_FIELD_NUMBER: builtins.int
+    CURVES_FIELD_NUMBER: builtins.int
+    phase: builtins.str
+    @property
+    def steps(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]: ...
+    @property
+    def curves(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___KeptCurve]: ...
+    def __init__(
+        self,
+        *,
+        phase: builtins.str = ...,
+        steps: collections.abc.Iterable[builtins.int] | None = ...,
+        curves: collections.abc.Iterable[Global___KeptCurve] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["curves", b"curves", "phase", b"phase", "steps", b"steps"]) -> None: ...
+
+Global___KeptPhase: typing_extensions.TypeAlias = KeptPhase
+
+@typing.final
+class KeptTraining(google.protobuf.message.Message):
+    """Training reports of an archived run."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    PHASE_FIELD_NUMBER: builtins.int
+    STEP_FIELD_NUMBER: builtins.int
+    REPORTED_S_FIELD_NUMBER: builtins.int
+    PHASES_FIELD_NUMBER: builtins.int
+    PLANS_STEP_FIELD_NUMBER: builtins.int
+    PLANS_FIELD_NUMBER: builtins.int
+    phase: builtins.str
+    """Latest report."""
+    step: builtins.int
+    reported_s: builtins.float
+    plans_step: builtins.int
+    """Step of the sampled plans."""
+    @property
+    def phases(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___KeptPhase]: ...
+    @property
+    def plans(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[embomatrix.proto.v1.rollout_service_pb2.SampledPlan]: ...
+    def __init__(
+        self,
+        *,
+        phase: builtins.str = ...,
+        step: builtins.int = ...,
+        reported_s: builtins.float = ...,
+        phases: collections.abc.Iterable[Global___KeptPhase] | None = ...,
+        plans_step: builtins.int = ...,
+        plans: collections.abc.Iterable[embomatrix.proto.v1.rollout_service_pb2.SampledPlan] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["phase", b"phase", "phases", b"phases", "plans", b"plans", "plans_step", b"plans_step", "reported_s", b"reported_s", "step", b"step"]) -> None: ...
+
+Global___KeptTraining: typing_extensions.TypeAlias = KeptTraining
+
+@typing.final
 class KeptRun(google.protobuf.message.Message):
     """Archived run on the manager's disk."""
 
@@ -903,17 +985,23 @@ class KeptRun(google.protobuf.message.Message):
 
     SUMMARY_FIELD_NUMBER: builtins.int
     EVENTS_FIELD_NUMBER: builtins.int
+    TRAINING_FIELD_NUMBER: builtins.int
     @property
     def summary(self) -> Global___GetRunResponse: ...
     @property
     def events(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RunEvent]: ...
+    @property
+    def training(self) -> Global___KeptTraining:
+        """Absent if its trainer did not report."""
+
     def __init__(
         self,
         *,
         summary: Global___GetRunResponse | None = ...,
         events: collections.abc.Iterable[Global___RunEvent] | None = ...,
+        training: Global___KeptTraining | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["summary", b"summary"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["events", b"events", "summary", b"summary"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["summary", b"summary", "training", b"training"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["events", b"events", "summary", b"summary", "training", b"training"]) -> None: ...
 
 Global___KeptRun: typing_extensions.TypeAlias = KeptRun

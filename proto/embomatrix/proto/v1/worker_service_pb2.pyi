@@ -450,6 +450,30 @@ class LeaseProgress(google.protobuf.message.Message):
 Global___LeaseProgress: typing_extensions.TypeAlias = LeaseProgress
 
 @typing.final
+class HostUse(google.protobuf.message.Message):
+    """Use of the worker's machine by all its programs."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    CPU_SHARE_FIELD_NUMBER: builtins.int
+    MEMORY_USED_MB_FIELD_NUMBER: builtins.int
+    MEMORY_MB_FIELD_NUMBER: builtins.int
+    cpu_share: builtins.float
+    """Share of all cores since the last heartbeat, 0 to 1."""
+    memory_used_mb: builtins.int
+    memory_mb: builtins.int
+    def __init__(
+        self,
+        *,
+        cpu_share: builtins.float = ...,
+        memory_used_mb: builtins.int = ...,
+        memory_mb: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["cpu_share", b"cpu_share", "memory_mb", b"memory_mb", "memory_used_mb", b"memory_used_mb"]) -> None: ...
+
+Global___HostUse: typing_extensions.TypeAlias = HostUse
+
+@typing.final
 class HeartbeatRequest(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -459,6 +483,8 @@ class HeartbeatRequest(google.protobuf.message.Message):
     LOAD_FIELD_NUMBER: builtins.int
     MEMORY_USED_MB_FIELD_NUMBER: builtins.int
     PROGRESS_FIELD_NUMBER: builtins.int
+    HOST_FIELD_NUMBER: builtins.int
+    LOG_LINES_FIELD_NUMBER: builtins.int
     session_id: builtins.str
     session_epoch: builtins.int
     load: builtins.float
@@ -469,6 +495,14 @@ class HeartbeatRequest(google.protobuf.message.Message):
 
     @property
     def progress(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseProgress]: ...
+    @property
+    def host(self) -> Global___HostUse:
+        """Absent if the worker does not measure it."""
+
+    @property
+    def log_lines(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """Lines of the worker's log that the manager has not acknowledged, oldest first, without secrets."""
+
     def __init__(
         self,
         *,
@@ -478,8 +512,11 @@ class HeartbeatRequest(google.protobuf.message.Message):
         load: builtins.float = ...,
         memory_used_mb: builtins.int = ...,
         progress: collections.abc.Iterable[Global___LeaseProgress] | None = ...,
+        host: Global___HostUse | None = ...,
+        log_lines: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["load", b"load", "memory_used_mb", b"memory_used_mb", "progress", b"progress", "running", b"running", "session_epoch", b"session_epoch", "session_id", b"session_id"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["host", b"host"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["host", b"host", "load", b"load", "log_lines", b"log_lines", "memory_used_mb", b"memory_used_mb", "progress", b"progress", "running", b"running", "session_epoch", b"session_epoch", "session_id", b"session_id"]) -> None: ...
 
 Global___HeartbeatRequest: typing_extensions.TypeAlias = HeartbeatRequest
 

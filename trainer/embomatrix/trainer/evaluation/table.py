@@ -20,12 +20,15 @@ if TYPE_CHECKING:
 VERSION: Final = 1
 NONE: Final = "–"
 COLUMNS: Final[Mapping[TaskCategory, str]] = {
-    TaskCategory.PICK_AND_PLACE: "pick and place",
-    TaskCategory.APPLIANCE_USE: "appliance using",
-    TaskCategory.KITCHEN_OPERATION: "kitchen operation",
-    TaskCategory.COMPOUND: "compound",
+    category: category.words
+    for category in (
+        TaskCategory.PICK_AND_PLACE,
+        TaskCategory.APPLIANCE_USE,
+        TaskCategory.KITCHEN_OPERATION,
+        TaskCategory.COMPOUND,
+    )
 }
-"""Categories by the paper's names, in its order."""
+"""Names of the categories, in the order of the paper's table."""
 INTERVALS: Final = (
     "Brackets: 95 % intervals over tasks (percentile bootstrap over tasks; Wilson intervals with tasks as trials if all tasks "
     "have the same rate)."

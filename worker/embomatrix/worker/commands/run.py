@@ -15,7 +15,7 @@ import psutil
 import typer
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
+from embomatrix.rpc.logs import LogFormat, LogTail, bind, hide, log_to_stderr
 from embomatrix.rpc.options import (
     Ca,
     CommandLine,
@@ -27,6 +27,7 @@ from embomatrix.rpc.options import (
     read_config,
 )
 from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.wire.bounds import LOG_LINE
 from embomatrix.worker.commands.options import StateDir, check_engine, fail, parse
 from embomatrix.worker.host.machine import HostMachine
 from embomatrix.worker.host.owner_policy import Preferences
@@ -40,6 +41,8 @@ from embomatrix.worker.slots.processes import ProcessGoneError
 logger = logging.getLogger(__name__)
 
 PREFERENCES: Final = frozenset(Preferences.model_fields)
+LINES_KEPT: Final = 50
+"""Latest log lines that a manager gets after a reconnection."""
 NOT_SETTINGS: Final = frozenset({"config", "labels", "verbose", "log_format"})
 """Options that are no settings of the daemon, or have another name there."""
 FILE_ONLY: Final = ("preferences", "slot_memory_mb", "drain_s", "grace_s", "calm_s", "check_s")
@@ -132,6 +135,8 @@ def lower_priority(nice: int) -> None:
 
 
 async def _serve(settings: WorkerSettings) -> None:
+    tail = LogTail(kept=LINES_KEPT, characters=LOG_LINE)
+    logging.getLogger("embomatrix").addHandler(tail)
     membership = await membership_of(settings)
     bind("worker", membership.name)
     machine = HostMachine(lambda: daemon_pids(settings.state_dir))
@@ -139,6 +144,11 @@ async def _serve(settings: WorkerSettings) -> None:
         for sentence in machine.unsupported(settings.preferences, await asyncio.to_thread(machine.observe)):
             logger.warning("%s", sentence)
     daemon = Daemon(
-        settings, measure(settings), np.random.default_rng(), membership=membership, probe=machine
+        settings,
+        measure(settings),
+        np.random.default_rng(),
+        membership=membership,
+        probe=machine,
+        log_tail=tail,
     )
     await serve(daemon, (signal.SIGINT, signal.SIGTERM))

@@ -13,6 +13,8 @@ from typing import Final, Protocol
 
 import psutil
 
+from embomatrix.host.limits import MIB
+from embomatrix.rpc.wire.values import HostUse
 from embomatrix.worker.host.owner_policy import Observation, Preferences
 
 SESSIONS_ASKED_S: Final = 10.0
@@ -159,6 +161,35 @@ class CpuTimes:
         return min(1.0, max(0.0, self.busy_s - before.busy_s - ours_s) / total_s) if total_s > 0 else 0.0
 
 
+class HostMeter:
+    """Use of this machine by all programs between two queries. A query takes a tenth of a millisecond."""
+
+    def __init__(self) -> None:
+        self._before = (0.0, 0.0)
+        self.use()
+
+    def use(self) -> HostUse | None:
+        """Return the use since the last query; None where the system hides it."""
+        try:
+            total_s, busy_s = _machine_cpu_s()
+            memory = psutil.virtual_memory()
+        except (psutil.Error, OSError):
+            return None
+        (total_before_s, busy_before_s), self._before = self._before, (total_s, busy_s)
+        spent_s = total_s - total_before_s
+        share = (busy_s - busy_before_s) / spent_s if spent_s > 0 else 0.0
+        used_mb = (memory.total - memory.available) // MIB
+        return HostUse(min(1.0, max(0.0, share)), used_mb, memory.total // MIB)
+
+
+def _machine_cpu_s() -> tuple[float, float]:
+    """Return the CPU seconds of all cores since boot, and the busy ones among them."""
+    whole = psutil.cpu_times()
+    # User time includes guest time already.
+    total_s = sum(whole) - getattr(whole, "guest", 0.0) - getattr(whole, "guest_nice", 0.0)
+    return total_s, total_s - whole.idle - getattr(whole, "iowait", 0.0)
+
+
 class OthersLoad:
     """CPU load of other programs between two queries."""
 
@@ -174,11 +205,7 @@ class OthersLoad:
         return share
 
     def _times(self) -> CpuTimes:
-        whole = psutil.cpu_times()
-        # User time includes guest time already.
-        total_s = sum(whole) - getattr(whole, "guest", 0.0) - getattr(whole, "guest_nice", 0.0)
-        idle_s = whole.idle + getattr(whole, "iowait", 0.0)
-        return CpuTimes(total_s, total_s - idle_s, sum(map(family_cpu_s, set(self._ours()))))
+        return CpuTimes(*_machine_cpu_s(), sum(map(family_cpu_s, set(self._ours()))))
 
 
 def family_cpu_s(pid: int) -> float:

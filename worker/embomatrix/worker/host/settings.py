@@ -50,6 +50,8 @@ class WorkerSettings(BaseModel):
     """Labels of this machine for operators."""
     preferences: Preferences = Field(default_factory=lambda: Preferences.model_validate({}))
     """Owner's preferences of when this machine works."""
+    send_log: bool = True
+    """Send the latest log lines, without secrets, to the manager, whose operators see them."""
     drain_s: float = Field(60.0, gt=0)
     """Time for running rollouts to end after a signal."""
     once: bool = False

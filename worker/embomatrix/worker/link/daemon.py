@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.host.backoff import Backoff
 from embomatrix.host.limits import MIB
-from embomatrix.rpc.logs import bind, hide
+from embomatrix.rpc.logs import LogTail, bind, hide
 from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import (
     ClusterError,
@@ -33,7 +33,7 @@ from embomatrix.rpc.wire.codec import ConvertError
 from embomatrix.rpc.wire.leases import LeaseResult
 from embomatrix.rpc.wire.session import lease_result_to_proto
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Resources
-from embomatrix.worker.host.machine import HostMachine, Probe
+from embomatrix.worker.host.machine import HostMachine, HostMeter, Probe
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.cache import BundleCache
 from embomatrix.worker.link.membership import Membership, MembershipFile
@@ -79,7 +79,10 @@ class Daemon:
         program: tuple[str, ...] = SIMULATOR_PROGRAM,
         membership: Membership | None = None,
         probe: Probe | None = None,
+        log_tail: LogTail | None = None,
     ) -> None:
+        self._meter = HostMeter()
+        self._log_tail = log_tail if settings.send_log else None
         self._settings = settings
         self._membership = membership or Membership(settings.manager, settings.name, settings.token)
         self._resources = resources
@@ -279,6 +282,8 @@ class Daemon:
             registration,
             self._pool,
             self._outbox,
+            meter=self._meter,
+            log_tail=self._log_tail,
             renewed_s=self._renewed(),
         )
         if self._draining.is_set():

@@ -14,11 +14,14 @@ import grpc
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
+from embomatrix.rpc.logs import LogTail
 from embomatrix.rpc.status import ClusterError, DeadlineError, NotFoundError, UnavailableError, cluster_errors
 from embomatrix.rpc.versions import SPOKEN
+from embomatrix.rpc.wire.bounds import LOG_LINES
 from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.leases import LeaseClaim, LeaseRef, WorkerState
 from embomatrix.rpc.wire.session import (
+    host_use_to_proto,
     lease_from_proto,
     lease_progress_to_proto,
     lease_ref_from_proto,
@@ -28,6 +31,7 @@ from embomatrix.rpc.wire.session import (
     write_lease_result,
 )
 from embomatrix.rpc.wire.values import InfraCode, Resources
+from embomatrix.worker.host.machine import HostMeter
 from embomatrix.worker.link.membership import Membership
 from embomatrix.worker.link.outbox import ResultOutbox
 from embomatrix.worker.slots.pool import SlotPool
@@ -99,8 +103,15 @@ class ManagerSession:
         pool: SlotPool,
         outbox: ResultOutbox,
         *,
+        meter: HostMeter,
+        log_tail: LogTail | None,
         renewed_s: float,
     ) -> None:
+        self._meter = meter
+        self._log_tail = log_tail
+        """Log lines for the manager; None: its operators see none."""
+        self._lines_sent = 0
+        """Number of the last line that the manager acknowledged in this session."""
         self._membership = membership
         self._address = membership.manager
         self._registration = registration
@@ -311,6 +322,8 @@ class ManagerSession:
         missed = 0
         while True:
             await asyncio.sleep(interval_s)
+            use = self._meter.use()
+            lines, last = self._log_tail.lines(self._lines_sent, LOG_LINES) if self._log_tail else ((), 0)
             request = pb.HeartbeatRequest(
                 session_id=self._registration.session_id,
                 session_epoch=self._registration.epoch,
@@ -318,6 +331,8 @@ class ManagerSession:
                 load=self._pool.load,
                 memory_used_mb=int(self._pool.memory_used_mb),
                 progress=[lease_progress_to_proto(progress) for progress in self._pool.progress()],
+                host=None if use is None else host_use_to_proto(use),
+                log_lines=lines,
             )
             try:
                 with cluster_errors(self._address):
@@ -328,5 +343,6 @@ class ManagerSession:
                     raise
                 continue
             missed = 0
+            self._lines_sent = last
             self.renewed_s = time.monotonic()
             interval_s = answer.next_interval_s or self._registration.heartbeat_s

@@ -7,7 +7,9 @@ import {learn} from "./names.js";
 const PAGES = {
   overview: () => import("./overview.js"), workers: () => import("./workers.js"), lookahead: () => import("./lookahead.js"), timeline: () => import("./timeline.js"),
   failures: () => import("./failures.js"), training: () => import("./training.js"), tasks: () => import("./tasks.js"),
+  runs: () => import("./runs.js"), rest: () => import("./rest.js"),
 };
+const PARTS = [() => import("./worker.js"), () => import("./run.js"), () => import("./compare.js")];
 const REFRESH_MS = 1000;
 /** Rows of workers in the snapshot, by page; other pages need none. */
 const ROWS = {workers: 50};
@@ -24,8 +26,7 @@ async function open() {
   try {
     code = Object.hasOwn(PAGES, name) ? await PAGES[name]() : unknown(name);
   } catch {
-    at("dot").className = "dot lost";
-    showStatus("a part of the dashboard failed to load: reload the page");
+    lost();
     return;
   }
   if (turn !== opened) return;
@@ -35,11 +36,22 @@ async function open() {
     if (link.getAttribute("href") === `#${name}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
-  document.title = `${name[0].toUpperCase()}${name.slice(1)} · EmboMatrix cluster`;
-  page.open(at("main"));
+  document.title = `${name === "rest" ? "REST" : name[0].toUpperCase() + name.slice(1)} · EmboMatrix cluster`;
+  try {
+    await page.open(at("main"));
+  } catch {
+    lost();
+    return;
+  }
+  if (turn !== opened) return;
   await refresh(page.asksMore?.() ? null : first);
   // Load the other pages in the background, so that they open at once, even while the manager is away.
-  setTimeout(() => Promise.allSettled(Object.values(PAGES).map(load => load())), REFRESH_MS);
+  setTimeout(() => Promise.allSettled([...Object.values(PAGES), ...PARTS].map(load => load())), REFRESH_MS);
+}
+
+function lost() {
+  at("dot").className = "dot lost";
+  showStatus("a part of the dashboard failed to load: reload the page");
 }
 
 /** Page for a name that is none. */
@@ -99,6 +111,7 @@ function showOverview(snapshot) {
 at("ask").addEventListener("submit", event => {
   event.preventDefault();
   sessionStorage.setItem("token", at("token").value);
+  delete at("ask").dataset.wanted;
   refresh();
 });
 // The URL's fragment names the page, so the skip link must not change it.

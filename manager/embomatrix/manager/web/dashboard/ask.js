@@ -29,7 +29,9 @@ async function answer(path, options = {}) {
     try { why = JSON.parse(text).detail ?? text; } catch { /* plain text */ }
     throw new Refused(typeof why === "string" && why ? why : `the manager answered with status ${response.status}`);
   }
-  document.getElementById("ask").hidden = true;
+  // A viewer who opened the form keeps it until the token is entered.
+  const form = document.getElementById("ask");
+  if (!form.dataset.wanted) form.hidden = true;
   return response;
 }
 

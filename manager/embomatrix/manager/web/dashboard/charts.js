@@ -19,8 +19,9 @@ function latest(drawn) {
   if (drawn.cursor.idx == null && last >= 0) drawn.setLegend({idx: last});
 }
 
-/** A chart in an element. `lines` are the names of the series; `words` formats the ticks of the x axis; `fill` fills a single line. */
-export function chart(place, lines, {high = 190, words, fill = false, legend = true} = {}) {
+/** A chart in an element. `lines` are the names of the series; `words` formats the ticks of the x axis, `across` names it and `steps` are its intervals; `most` is the
+ * end of the y axis; `fill` fills a single line. */
+export function chart(place, lines, {high = 190, words, across = "step", steps = WHOLE, most: end, fill = false, legend = true} = {}) {
   const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
   const series = lines.map((label, i) => ({
     label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], spanGaps: true,
@@ -30,6 +31,7 @@ export function chart(place, lines, {high = 190, words, fill = false, legend = t
     value: (_, value) => value === null || value === undefined ? "–" : signed(Math.abs(value) < LEAST ? 0 : Number(value.toPrecision(3))),
   }));
   const range = (_, low, top) => {
+    if (end) return [0, end];
     const least = Math.min(0, low ?? 0), most = top > least ? top : least + 1;
     return [least && least * 1.08, fill ? Math.max(1, most) * 1.08 : most + (most - least) * 0.08];
   };
@@ -37,8 +39,8 @@ export function chart(place, lines, {high = 190, words, fill = false, legend = t
   place.replaceChildren(box);
   const drawn = new uPlot({
     width: box.clientWidth, height: high, legend: {show: legend}, cursor: {y: false}, scales: {x: {time: false}, y: {range}},
-    axes: [{...axis, size: 28, incrs: WHOLE, ...(words ? {values: (_, ticks) => ticks.map(words)} : {})}, {...axis, size: 52}],
-    series: [{label: "step", value: (_, value) => value ?? "–"}, ...series],
+    axes: [{...axis, size: 28, incrs: steps, ...(words ? {values: (_, ticks) => ticks.map(words)} : {})}, {...axis, size: 52}],
+    series: [{label: across, value: (_, value) => value === null || value === undefined ? "–" : words ? words(value) : value}, ...series],
     // Without a cursor, the legend shows the latest values.
     hooks: {setCursor: [latest]},
   }, [[], ...lines.map(() => [])], box);

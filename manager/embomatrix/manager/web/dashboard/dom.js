@@ -34,6 +34,16 @@ export function clock(seconds) {
 }
 /** Text with a minus sign instead of a hyphen. */
 export const signed = text => String(text).replace("-", "\u2212");
+/** Date and time to the minute. */
+export const moment = seconds => `${new Date(seconds * 1000).toISOString().slice(0, 16).replace("T", " ")} UTC`;
+/** Date and time to the second, which a saved page needs. */
+export const stamp = seconds => `${new Date(seconds * 1000).toISOString().slice(0, 19).replace("T", " ")} UTC`;
+/** The part of the page's address after the question mark. */
+export const asked = () => location.hash.split("?").slice(1).join("?");
+/** Text of an encoded part of an address; a malformed one as it is. */
+export const decoded = text => { try { return decodeURIComponent(text); } catch { return text; } };
+/** Name of a task's category, as all pages and reports write it. */
+export const categoryWords = category => category.replaceAll("_", " ");
 export const splitWords = split => split === "heldout" ? "held out" : split;
 export const none = text => h("div", {class: "none"}, text);
 export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();

@@ -1,19 +1,19 @@
 // Overview: throughput, latency, prewarm hits, failures, runs.
 import {chart} from "./charts.js";
 import {at, count, h, none, put, seconds, share, signed, table} from "./dom.js";
+import {phaseTable} from "./parts.js";
 
 const TILES = [
   ["rate", "Throughput", "rollouts/s, 10\u00a0s mean"], ["p50", "Latency", ""], ["hits", "Prewarm hits", ""],
   ["slots", "Slots at work", ""], ["overhead", "Overhead", ""], ["bad", "Failures", ""],
 ];
-const PHASES = {queue: "waiting for a lease", lease: "network and waiting for a slot", load: "loading the scene", execute: "executing the plan", deliver: "writing the result"};
 let drawn = null;
 
 export function open(main) {
   main.replaceChildren(
     ...TILES.map(([id, title, note]) => h("section", {class: "tile"}, h("h2", {}, title), h("b", {id}, "–"), h("span", {id: `${id}note`}, note))),
     h("section", {class: "most"}, h("h2", {}, "Completed rollouts per second ", h("small", {id: "peak"})), h("div", {id: "chart", role: "img", "aria-label": "rollouts per second over two minutes"})),
-    h("section", {class: "third"}, h("h2", {}, "Runs"), h("div", {id: "runs"})),
+    h("section", {class: "third"}, h("h2", {}, "Open runs ", h("small", {}, h("a", {href: "#runs"}, "all runs"))), h("div", {id: "runs"})),
     h("section", {class: "most"}, h("h2", {}, "Latency by phase ", h("small", {}, "of completed rollouts since the manager started")), h("div", {id: "phases"})),
     h("section", {class: "third"}, h("h2", {}, "Outcomes"), h("div", {id: "outcomes"})),
   );
@@ -42,23 +42,14 @@ export function show({overview: o, runs}) {
   const ago = o.throughput.map((_, i) => i - o.throughput.length + 1);
   drawn.draw(ago, [o.throughput.map((done, i) => -ago[i] > o.uptime_s ? null : done)]);
   put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["shared", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));
-  put(at("phases"), phases(o.phases));
+  put(at("phases"), phaseTable(o.phases));
   const rows = Object.entries(o.outcomes).sort((a, b) => b[1] - a[1]).map(([name, n]) => h("tr", {}, h("td", {}, h("code", {}, name)), h("td", {class: "n"}, count(n))));
   put(at("outcomes"), rows.length ? table(["outcome", ["rollouts", "n"]], rows, "outcomes") : none("No rollout has been executed yet."));
 }
 
-function phases(durations) {
-  const all = Object.values(durations).reduce((sum, one) => sum + one.sum_s, 0);
-  if (!all) return none("No rollout has been executed yet.");
-  const rows = Object.entries(durations).map(([name, one]) => h("tr", {}, h("td", {class: "fit"}, name, h("span", {class: "muted wideonly"}, ` ${PHASES[name] ?? ""}`)),
-    h("td", {}, h("span", {class: "share", style: `width:${(100 * one.sum_s / all).toFixed(1)}%`})), h("td", {class: "n fit"}, share(one.sum_s, all)),
-    [one.p50_s, one.p95_s, one.p99_s].map(s => h("td", {class: "n fit"}, s ? seconds(s) : "0\u00a0ms"))));
-  return table(["phase", "", ["share", "n"], ["median", "n"], ["95 %", "n"], ["99 %", "n"]], rows, "latency by phase");
-}
-
 function run(r) {
   return h("tr", {},
-    h("td", {class: "named", title: `${r.name} ${r.run_id}`}, h("a", {href: `#timeline?${encodeURIComponent(r.run_id)}`}, r.name || r.run_id)),
+    h("td", {class: "named", title: `${r.name} ${r.run_id}`}, h("a", {href: `#runs?${encodeURIComponent(r.run_id)}`}, r.name || r.run_id)),
     h("td", {class: "n"}, count(r.stats.delivered)), h("td", {class: "n"}, count(r.pending)),
     h("td", {class: "n"}, share(r.stats.warm_starts, r.stats.warm_starts + r.stats.cold_starts)),
     h("td", {class: "n", title: "steps that were known from equal plans or beginnings and not executed"}, share(r.stats.shared_steps, r.stats.steps)),

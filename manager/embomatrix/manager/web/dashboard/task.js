@@ -1,6 +1,6 @@
 // One task: instruction, objects, transcript, and the oracle's plan on the floor plan.
 import {ask, picture} from "./ask.js";
-import {at, h, put, splitWords, table} from "./dom.js";
+import {at, categoryWords, h, put, splitWords, table} from "./dom.js";
 import {drawn} from "./plan.js";
 
 const STEP_MS = 1200;
@@ -16,7 +16,7 @@ export async function open(place, task_id) {
   const detail = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = detail, about = new Set(detail.objects.filter(row => row.goal).map(row => row.name));
   ({moments} = detail);
   view = drawn(detail.floor, {rooms: detail.rooms, about, things: detail.things, label: `floor plan of ${card.scene_id}`});
-  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", splitWords(card.split)], ["source", detail.source], ["profile", detail.profile], ["goal type", detail.signature]];
+  const facts = [["scene", card.scene_id], ["category", categoryWords(card.category)], ["split", splitWords(card.split)], ["source", detail.source], ["profile", detail.profile], ["goal type", detail.signature]];
   const steps = moments.map((moment, i) => h("li", {}, h("button", {type: "button", class: "step", onclick: () => { close(); go(i); }}, moment.call || "start")));
   const button = (id, words, act) => h("button", {type: "button", id, onclick: act}, words);
   place.replaceChildren(

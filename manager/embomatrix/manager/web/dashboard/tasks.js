@@ -1,6 +1,6 @@
 // Tasks of the dataset: a gallery with pictures of their scenes, and a page for each task.
 import {Refused, ask, picture} from "./ask.js";
-import {at, count, counted, h, none, put, splitWords} from "./dom.js";
+import {at, categoryWords, count, counted, decoded, h, none, put, splitWords} from "./dom.js";
 import {drawn} from "./plan.js";
 import * as task from "./task.js";
 
@@ -12,7 +12,7 @@ export function open(main) {
   const chosen = location.hash.split("?")[1];
   if (chosen) {
     main.replaceChildren(h("section", {}, none("Loading the task…")));
-    task.open(main, decodeURIComponent(chosen)).catch(error => main.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), refused(error))));
+    task.open(main, decoded(chosen)).catch(error => main.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), refused(error))));
     return;
   }
   watcher = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(({target}) => { watcher.unobserve(target); look(target); }), {rootMargin: "200px"});
@@ -54,7 +54,7 @@ function list(page) {
   at("before").disabled = page.offset === 0;
   at("after").disabled = last >= total;
   choices("scene", "all scenes", page.scenes.map(one => [one.scene_id, `${one.scene_id} (${count(one.tasks)})`]));
-  choices("category", "all categories", page.categories.map(name => [name, name.replaceAll("_", " ")]));
+  choices("category", "all categories", page.categories.map(name => [name, categoryWords(name)]));
   put(at("cards"), page.items.length ? page.items.map(card) : none(page.notice || "No task matches."));
   for (const place of at("cards").querySelectorAll(".thumb:empty")) watcher.observe(place);
 }
@@ -65,7 +65,7 @@ function choices(id, every, pairs) {
 
 function card(one) {
   return h("a", {class: "card", href: `#tasks?${encodeURIComponent(one.task_id)}`}, h("span", {class: "thumb", "data-digest": one.bundle_digest, "data-picture": String(one.picture), "data-scene": one.scene_id}),
-    h("span", {class: "instruction"}, one.instruction), h("span", {class: "muted facts"}, [one.category.replaceAll("_", " "), one.scene_id, `${one.steps} steps`, splitWords(one.split)].map(fact => h("span", {}, fact))));
+    h("span", {class: "instruction"}, one.instruction), h("span", {class: "muted facts"}, [categoryWords(one.category), one.scene_id, `${one.steps} steps`, splitWords(one.split)].map(fact => h("span", {}, fact))));
 }
 
 async function look(place) {

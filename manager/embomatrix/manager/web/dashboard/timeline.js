@@ -1,6 +1,6 @@
 // Timeline of slots: loading, executing, delivering, idle. Zooms down to one rollout.
 import {ask} from "./ask.js";
-import {at, colour, count, h, none, put, seconds, signed} from "./dom.js";
+import {at, colour, count, decoded, h, none, put, seconds, signed} from "./dom.js";
 import {named} from "./names.js";
 
 const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1, LEAST_VIEW_S = 0.001, TICK = 80;
@@ -9,7 +9,7 @@ const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], 
 let run = "", timeline = null, view = null, live = true, span = 60, painted = [], grabbed = null, edge = NAMES, search = "", typed = 0;
 
 export function open(main) {
-  run = decodeURIComponent(location.hash.split("?")[1] ?? "");
+  run = decoded(location.hash.split("?")[1] ?? "");
   timeline = view = null; live = true;
   const legend = KINDS.map(([word, tint]) => [h("i", {style: `background:var(--${tint})`}), word]);
   main.replaceChildren(h("section", {},
@@ -29,7 +29,7 @@ export async function show({runs}) {
   const known = runs.map(r => r.run_id);
   if (!run) run = (runs.findLast(r => r.pending || r.stats.delivered) ?? runs.at(-1))?.run_id ?? "";
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
-  if (!run) { put(at("tracks"), none("No open run. For a closed run: embomatrix cluster report RUN")); return; }
+  if (!run) { put(at("tracks"), none("No open run. Closed runs are on the page Runs.")); return; }
   if (!live && timeline) { draw(); return; } // the window or the theme may be another by now
   timeline = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
   if (live) {

@@ -1,7 +1,8 @@
 // Training: reward by tier, success, zero-variance groups, time, and sampled plans with their results.
-import {ask} from "./ask.js";
+import {Refused, ask} from "./ask.js";
 import {chart} from "./charts.js";
-import {at, clock, count, h, none, put, seconds, share, signed, table} from "./dom.js";
+import {at, categoryWords, clock, count, decoded, h, none, put, seconds, share, table} from "./dom.js";
+import {sampledPlan} from "./parts.js";
 
 const CHARTS = [
   ["tiers", "Reward by tier", "mean per step", {reward: "all", reward_goal: "goal", reward_relevance: "relevance", reward_format: "format"}],
@@ -13,10 +14,12 @@ const CHARTS = [
 ];
 const TILES = [["step", "Step"], ["reward", "Reward"], ["solved", "Success"], ["flat", "Zero-variance groups"], ["entropy", "Entropy"], ["long", "Plan length"]];
 const LATEST = 10;
+/** Run of the page's address, whose reports the manager may have on disk only. */
+let wanted = "";
 let run = "", seen = "", drawn = {}, report = null;
 
 export function open(main) {
-  run = decodeURIComponent(location.hash.split("?")[1] ?? "");
+  run = wanted = decoded(location.hash.split("?")[1] ?? "");
   seen = ""; drawn = {}; report = null;
   main.replaceChildren(
     h("section", {}, h("h2", {}, "Training ", h("small", {id: "when"})),
@@ -35,17 +38,26 @@ export function close() {
 }
 
 export async function show({training}) {
-  if (!training.some(one => one.run_id === run)) run = training[0]?.run_id ?? "";
+  if (!training.some(one => one.run_id === run) && (!run || run !== wanted)) run = training[0]?.run_id ?? "";
   if (!run && report) {  // another manager leads, and no trainer has reported to it yet
     close();
     open(at("main"));
   }
-  put(at("run"), training.map(one => h("option", {value: one.run_id, selected: one.run_id === run}, one.name || one.run_id)));
+  const archived = wanted && !training.some(one => one.run_id === wanted) ? [report?.run.run_id === wanted ? report.run : {run_id: wanted, name: "", revision: 1}] : [];
+  const every = [...archived, ...training];
+  put(at("run"), every.map(one => h("option", {value: one.run_id, selected: one.run_id === run}, one.name || one.run_id)));
   at("run").hidden = !run;
   put(at("nothing"), run ? [] : h("section", {}, none("No trainer has reported yet. Start one with embomatrix train, and --manager if the manager is on another machine.")));
-  const view = training.find(one => one.run_id === run);
+  const view = every.find(one => one.run_id === run);
   if (!view || seen === `${run} ${view.revision}`) return;
-  const fresh = await ask(`training/${encodeURIComponent(run)}`);
+  let fresh;
+  try {
+    fresh = await ask(`training/${encodeURIComponent(run)}`);
+  } catch (error) {
+    if (!(error instanceof Refused) || !archived.length) throw error;
+    put(at("nothing"), h("section", {}, none(error.message)));
+    return;
+  }
   if (!at("sampled")) return;
   if (report?.run.run_id !== run) close();
   report = fresh;
@@ -66,7 +78,7 @@ function draw({run: view, phases, plans, plans_step}) {
   spent(grpo.figures);
   heldout(named);
   at("which").textContent = plans.length ? `with the largest reward differences in step ${count(plans_step)}: ${plans[0].instruction}` : "";
-  put(at("sampled"), plans.length ? plans.map(plan) : none("No plans yet."));
+  put(at("sampled"), plans.length ? plans.map(sampledPlan) : none("No plans yet."));
 }
 
 function tiles({steps, figures}) {
@@ -88,7 +100,7 @@ function lines(id, {steps, figures}, names, prefix = null) {
   const found = [...Object.keys(names).filter(name => name in figures), ...more];
   at(id).closest("section").hidden = !found.length;
   if (!found.length) return;
-  const labels = found.map(name => names[name] ?? name.slice(prefix.length).replaceAll("_", " "));
+  const labels = found.map(name => names[name] ?? categoryWords(name.slice(prefix.length)));
   if (drawn[id]?.lines.join() !== labels.join()) {
     drawn[id]?.close();
     drawn[id] = chart(at(id), labels);
@@ -109,15 +121,6 @@ function heldout(named) {
   const times = ["before GRPO", "after GRPO"], successes = times.map(when => named[`success ${when}`]?.figures);
   const groups = [...new Set(successes.flatMap(figures => Object.keys(figures ?? {})))].sort((a, b) => (b === "all") - (a === "all") || a.localeCompare(b));
   const cell = (figures, group) => figures?.[group]?.at(-1) === undefined ? "–" : share(figures[group].at(-1), 1);
-  const rows = groups.map(group => h("tr", {}, h("td", {}, group === "all" ? "all tasks" : group.replaceAll("_", " ")), successes.map(figures => h("td", {class: "n"}, cell(figures, group)))));
+  const rows = groups.map(group => h("tr", {}, h("td", {}, group === "all" ? "all tasks" : categoryWords(group)), successes.map(figures => h("td", {class: "n"}, cell(figures, group)))));
   put(at("heldout"), rows.length ? table(["tasks", ...times.map(when => [when, "n"])], rows, "held-out success") : none("Not evaluated. Datasets with held-out tasks are evaluated before the first and after the last step."));
-}
-
-const points = number => signed(number.toFixed(2));
-
-function plan({text, reward, advantage, problem, steps, task_id}) {
-  const verdict = reward ? [h("b", {class: reward.success ? "reached" : ""}, reward.success ? "reached the goal" : "did not reach the goal"),
-    ` · reward ${points(reward.format + reward.relevance + reward.goal)} (format ${points(reward.format)}, relevance ${points(reward.relevance)}, goal ${points(reward.goal)}) · advantage ${points(advantage)}`] : h("b", {class: "bad"}, "infrastructure failure, no reward");
-  return h("div", {class: "plan"}, h("p", {}, verdict, h("span", {class: "muted"}, ` · ${task_id}`)), problem && h("p", {class: "bad message"}, problem), h("pre", {tabindex: "0"}, text || "(nothing)"),
-    steps.length > 0 && h("ol", {class: "steps"}, steps.map(step => h("li", {}, h("code", {class: step.ok ? "reached" : "bad"}, step.skill), ` ${step.message || (step.ok ? "done" : "failed")}`))));
 }

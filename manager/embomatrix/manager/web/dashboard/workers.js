@@ -1,18 +1,28 @@
-// Workers: scenes, slots, state, and the commands drain and resume.
+// Workers: scenes, slots, state, machine, and the commands drain and resume. Each has a page of its own.
 import {Refused, change} from "./ask.js";
-import {at, count, gauge, h, none, put, seconds, table} from "./dom.js";
+import {asked, at, count, decoded, gauge, h, none, put, seconds, share, table} from "./dom.js";
 import {named, worded} from "./names.js";
+import {command, learnRole, refusal, showRefusal} from "./role.js";
 
 const ROWS = 50, CHIPS = 6;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined", "left"];
 const GONE = ["lost", "left"];
 const filters = {state: "", search: "", offset: 0, limit: ROWS};
+let inner = null;
 
 export const query = () => filters;
 /** True if a filter or a later page is selected. */
 export const asksMore = () => Boolean(filters.state || filters.search || filters.offset);
 
-export function open(main) {
+export async function open(main) {
+  inner = null;
+  learnRole().catch(() => {}); // the first refresh repeats the request
+  if (asked()) {
+    const name = decoded(asked());
+    inner = await import("./worker.js");
+    inner.open(main, name);
+    return;
+  }
   const options = STATES.map(state => h("option", {value: state, selected: state === filters.state}, state || "all states"));
   main.replaceChildren(h("section", {},
     h("h2", {}, "Workers ", h("small", {id: "total"})),
@@ -22,18 +32,28 @@ export function open(main) {
       h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, filters.offset - ROWS)})}, "Previous"),
       h("button", {id: "after", type: "button", onclick: () => ask({offset: filters.offset + ROWS})}, "Next"),
       h("button", {id: "dispatch", type: "button"}, "Pause dispatch"),
-      h("span", {id: "answer", class: "bad", role: "alert"})),
+      h("span", {id: "allowed", class: "muted"}), h("span", {id: "answer", class: "bad", role: "alert"})),
     h("div", {id: "workers"})));
 }
 
-export function show({workers, paused}) {
+export function close() {
+  inner?.close();
+}
+
+export async function show({workers, paused}) {
+  if (inner) { await inner.show(); return; }
+  await learnRole();
+  if (!at("workers")) return;
+  showRefusal();
   const last = Math.min(workers.total, workers.offset + workers.items.length);
   at("total").textContent = workers.total ? `${count(workers.offset + 1)} to ${count(last)} of ${count(workers.total)}` : "";
   at("before").disabled = workers.offset === 0;
   at("after").disabled = last >= workers.total;
   at("dispatch").textContent = paused ? "Resume dispatch" : "Pause dispatch";
+  at("dispatch").disabled = Boolean(refusal());
+  at("dispatch").title = refusal();
   at("dispatch").onclick = () => steer(`dispatch/${paused ? "resume" : "pause"}`);
-  const headings = ["worker", "state", "slots", "scenes", ["scene memory", "wideonly"], ["completed", "n"], ["cores", "n wideonly"], ["last heard", "n wideonly"], ""];
+  const headings = ["worker", "state", "slots", "scenes", ["scene memory", "wideonly"], ["completed", "n"], "machine", ["last heard", "n wideonly"], ""];
   const emptyText = filters.state || filters.search ? "No worker matches." : "No workers yet. Start one with: embomatrix worker run";
   put(at("workers"), workers.items.length ? table(headings, workers.items.map(row), "workers", "loose") : none(emptyText));
   for (const button of at("workers").querySelectorAll("button")) button.onclick = () => steer(button.dataset.path);
@@ -43,14 +63,21 @@ function row(w) {
   const used = w.residents.reduce((sum, r) => sum + r.memory_mb, 0);
   const away = w.state === "draining", labels = Object.entries(w.labels).map(([name, value]) => `${name} ${value}`);
   return h("tr", {},
-    h("td", {class: "named"}, w.worker_id, w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`), labels.length > 0 && h("div", {class: "muted labels"}, labels.join(", "))),
+    h("td", {class: "named"}, h("a", {href: `#workers?${encodeURIComponent(w.worker_id)}`}, w.worker_id), w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`), labels.length > 0 && h("div", {class: "muted labels"}, labels.join(", "))),
     h("td", {class: w.reason ? "why" : "fit"}, h("span", {class: `dot ${w.state}`}), w.state, w.reason && h("span", {class: "muted"}, ` ${w.reason}`)),
     h("td", {class: "fit"}, slots(w)),
     h("td", {"data-name": w.residents.length || w.loads.length ? false : "scenes"}, scenes(w)),
     h("td", {class: "wideonly"}, gauge(used, w.memory_mb, `${count(Math.round(used))} of ${count(w.memory_mb)} MB`)),
-    h("td", {class: "n", "data-name": "completed"}, count(w.completed)), h("td", {class: "n wideonly"}, w.cores),
+    h("td", {class: "n", "data-name": "completed"}, count(w.completed)), h("td", {class: "fit", "data-name": "machine"}, machine(w)),
     h("td", {class: "n muted wideonly"}, w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`),
-    h("td", {class: "fit act"}, !GONE.includes(w.state) && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
+    h("td", {class: "fit act"}, !GONE.includes(w.state) && h("button", command({class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}), away ? "Resume" : "Drain")));
+}
+
+/** Cores, and the use of CPU and memory by all programs of the machine. */
+function machine(w) {
+  const cores = `${count(w.cores)} core${w.cores === 1 ? "" : "s"}`;
+  if (!w.host) return cores;
+  return [h("div", {class: "wideonly"}, cores), `CPU ${share(w.host.cpu_share, 1)}, memory ${share(w.host.memory_used_mb, w.host.memory_mb)}`];
 }
 
 function slots(w) {

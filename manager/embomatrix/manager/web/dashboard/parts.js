@@ -1,0 +1,46 @@
+// Parts that several pages show: totals of a run, durations by phase, failures, and sampled plans.
+import {count, h, none, seconds, share, signed, stamp, table} from "./dom.js";
+import {named, worded} from "./names.js";
+
+const PHASES = {queue: "waiting for a lease", lease: "network and waiting for a slot", load: "loading the scene", execute: "executing the plan", deliver: "writing the result"};
+const UNITS = {
+  count: value => count(value), share: value => `${(100 * value).toFixed(1)}\u00a0%`, seconds: value => value ? seconds(value) : "0\u00a0s",
+  rate: value => `${value >= 100 ? count(Math.round(value)) : value.toFixed(1)}/s`, number: value => signed(value.toFixed(2)),
+};
+const MESSAGES = 50;
+
+/** Text of a total of a run; a dash without a value. */
+export const totalText = ({value, unit}) => value === null ? "–" : UNITS[unit](value);
+
+/** Durations of rollouts by phase: share of the time, median, and high percentiles. */
+export function phaseTable(durations) {
+  const all = Object.values(durations).reduce((sum, one) => sum + one.sum_s, 0);
+  if (!all) return none("No rollout has been executed yet.");
+  const rows = Object.entries(durations).map(([name, one]) => h("tr", {}, h("td", {class: "fit"}, name, h("span", {class: "muted wideonly"}, ` ${PHASES[name] ?? ""}`)),
+    h("td", {}, h("span", {class: "share", style: `width:${(100 * one.sum_s / all).toFixed(1)}%`})), h("td", {class: "n fit"}, share(one.sum_s, all)),
+    [one.p50_s, one.p95_s, one.p99_s].map(s => h("td", {class: "n fit"}, s ? seconds(s) : "0\u00a0ms"))));
+  return table(["phase", "", ["share", "n"], ["median", "n"], ["95 %", "n"], ["99 %", "n"]], rows, "latency by phase");
+}
+
+/** Failed leases and rollouts of a run, the latest first, with their number by reason. */
+export function failureParts(events) {
+  if (!events.length) return [none("None: every lease brought a result.")];
+  const reasons = {};
+  for (const {code} of events) reasons[code] = (reasons[code] ?? 0) + 1;
+  const counts = Object.entries(reasons).sort((a, b) => b[1] - a[1]).map(([code, n]) => events.length === 1 ? code : `${count(n)} ${code}`).join(", ");
+  const rows = events.slice(-MESSAGES).reverse().map(event => h("tr", {}, h("td", {class: "muted fit"}, stamp(event.at_s)), h("td", {class: "fit"}, event.kind === "failed" ? "attempt" : "rollout"),
+    h("td", {class: "fit"}, h("code", {class: "bad"}, event.code)), h("td", {class: "named"}, event.worker_id ?? ""), h("td", {class: "named"}, event.rollout_id ?? ""),
+    h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "message"}, worded(event.message ?? ""))));
+  return [h("p", {}, `${events.length === 1 ? "One failure" : `The latest ${count(events.length)} failures`}: ${counts}.`), table(["when", "failed", "reason", "worker", "rollout", "scene", "message"], rows, "failures", "loose"),
+    events.length > MESSAGES ? none(`The table shows the last ${MESSAGES}.`) : ""];
+}
+
+const points = number => signed(number.toFixed(2));
+
+/** Plan that a policy wrote, with its reward and the result of each call. */
+export function sampledPlan({text, reward, advantage, problem, steps, task_id}) {
+  const verdict = reward ? [h("b", {class: reward.success ? "reached" : ""}, reward.success ? "reached the goal" : "did not reach the goal"),
+    ` · reward ${points(reward.format + reward.relevance + reward.goal)} (format ${points(reward.format)}, relevance ${points(reward.relevance)}, goal ${points(reward.goal)}) · advantage ${points(advantage)}`] : h("b", {class: "bad"}, "infrastructure failure, no reward");
+  return h("div", {class: "plan"}, h("p", {}, verdict, h("span", {class: "muted"}, ` · ${task_id}`)), problem && h("p", {class: "bad message"}, problem), h("pre", {tabindex: "0"}, text || "(nothing)"),
+    steps.length > 0 && h("ol", {class: "steps"}, steps.map(step => h("li", {}, h("code", {class: step.ok ? "reached" : "bad"}, step.skill), ` ${step.message || (step.ok ? "done" : "failed")}`))));
+}

@@ -1,0 +1,90 @@
+// One worker: its state, its machine's CPU and memory in the last half hour, its scenes, and its last log lines.
+import {Refused, ask, change} from "./ask.js";
+import {chart} from "./charts.js";
+import {at, count, h, none, put, seconds, share, table} from "./dom.js";
+import {named, worded} from "./names.js";
+import {command, learnRole, showRefusal} from "./role.js";
+
+const LOOK_EVERY = 2, GONE = ["lost", "left"];
+/** Ticks at whole minutes of the day. */
+const MINUTES = [60, 120, 300, 600, 1800];
+const timeOfDay = at_s => `${new Date(at_s * 1000).toISOString().slice(11, 16)} UTC`;
+let name = "", looks = 0, drawn = {};
+
+export function open(main, worker_id) {
+  name = worker_id; looks = 0; drawn = {};
+  main.replaceChildren(
+    h("section", {}, h("h2", {}, h("a", {href: "#workers"}, "All workers")), h("p", {class: "instruction", id: "title"}, worker_id),
+      h("div", {class: "bar"}, h("span", {id: "command"}), h("span", {id: "allowed", class: "muted"}), h("span", {id: "answer", class: "bad", role: "alert"})), h("div", {id: "facts"})),
+    h("section", {class: "half", hidden: true}, h("h2", {}, "CPU ", h("small", {id: "cpunow"})), h("div", {id: "cpu", role: "img", "aria-label": "CPU use of the machine in the last half hour"})),
+    h("section", {class: "half", hidden: true}, h("h2", {}, "Memory ", h("small", {id: "memorynow"})), h("div", {id: "memory", role: "img", "aria-label": "memory use of the machine in the last half hour"})),
+    h("section", {class: "wide machine", hidden: true}, none("The worker does not report the use of its machine: it is older than this manager, or has joined just now.")),
+    h("section", {hidden: true}, h("h2", {}, "Scenes"), h("div", {id: "scenes"})),
+    h("section", {hidden: true}, h("h2", {}, "Log ", h("small", {}, "last lines of the worker, without secrets; times are UTC")), h("div", {id: "log"})));
+}
+
+export function close() {
+  for (const one of Object.values(drawn)) one.close();
+  drawn = {};
+}
+
+export async function show() {
+  if (looks++ % LOOK_EVERY) return;
+  const path = `workers/${encodeURIComponent(name)}`;
+  try {
+    const [{worker, host}, {lines}] = await Promise.all([ask(path), ask(`${path}/log`), learnRole()]);
+    if (!at("log") || worker.worker_id !== name) return;
+    for (const id of ["scenes", "log"]) at(id).closest("section").hidden = false;
+    about(worker);
+    machine(worker, host);
+    const rows = [...worker.residents.map(scene), ...worker.loads.map(digest => h("tr", {}, h("td", {class: "named"}, h("code", {title: digest}, named(digest))), h("td", {class: "fit"}, "requested"), h("td"), h("td"), h("td")))];
+    put(at("scenes"), rows.length ? table(["scene", "state", ["load time", "n"], ["memory", "n"], "message"], rows, "scenes of the worker", "loose") : none("It holds no scene."));
+    put(at("log"), lines.length ? h("pre", {class: "log", tabindex: "0"}, lines.join("\n")) : none("The worker has sent no lines: it has joined just now, runs with --no-send-log, or is older than this manager."));
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    if (at("title")) at("title").textContent = error.message;
+  }
+}
+
+function about(w) {
+  const away = w.state === "draining", labels = Object.entries(w.labels).map(([key, value]) => `${key} ${value}`).join(", ");
+  put(at("command"), GONE.includes(w.state) ? [] : h("button", command({type: "button"}), away ? "Resume" : "Drain"));
+  const button = at("command").querySelector("button");
+  if (button) button.onclick = () => steer(`workers/${encodeURIComponent(name)}/${away ? "resume" : "drain"}`);
+  showRefusal();
+  const facts = [["state", [h("span", {class: `dot ${w.state}`}), w.state, w.reason && ` (${w.reason})`]], ["slots", `${w.busy} of ${w.slots} busy${w.waiting ? `, ${count(w.waiting)} rollouts wait behind them` : ""}`],
+    ["completed", count(w.completed)], ["cores", count(w.cores)], ["memory for scenes", `${count(w.memory_used_mb)} of ${count(w.memory_mb)} MB`], ["GPU", w.gpu], ["labels", labels],
+    ["versions", Object.entries(w.versions).map(pair => pair.join(" ")).join(", ")], ["audited results", w.audited ? `${count(w.audited)}, ${count(w.audit_mismatches)} of them different` : ""],
+    ["last heard", w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`]];
+  put(at("facts"), h("dl", {class: "facts"}, facts.filter(([, value]) => value).map(([key, value]) => h("div", {}, h("dt", {}, key), h("dd", {}, value)))));
+}
+
+function machine(worker, host) {
+  const known = host.at_s.length > 0;
+  for (const id of ["cpu", "memory"]) at(id).closest("section").hidden = !known;
+  at("main").querySelector(".machine").hidden = known;
+  if (!known) return;
+  const options = {across: "from", words: timeOfDay, steps: MINUTES, fill: true};
+  drawn.cpu ??= chart(at("cpu"), ["% of all cores"], {...options, most: 100});
+  drawn.memory ??= chart(at("memory"), ["MB used"], {...options, most: host.memory_mb});
+  drawn.cpu.draw(host.at_s, [host.cpu_share.map(share => 100 * share)]);
+  drawn.memory.draw(host.at_s, [host.memory_used_mb]);
+  at("cpunow").textContent = worker.host ? `${share(worker.host.cpu_share, 1)} of ${count(worker.cores)} cores now, by all programs` : "";
+  at("memorynow").textContent = worker.host ? `${count(worker.host.memory_used_mb)} of ${count(worker.host.memory_mb)} MB now, by all programs` : "";
+}
+
+function scene(r) {
+  return h("tr", {}, h("td", {class: "named"}, h("code", {title: r.bundle_digest}, named(r.bundle_digest))), h("td", {class: "fit"}, r.state),
+    h("td", {class: "n", "data-name": "load time"}, r.load_s ? seconds(r.load_s) : ""), h("td", {class: "n", "data-name": "memory"}, r.memory_mb ? `${count(Math.round(r.memory_mb))} MB` : ""), h("td", {class: "message"}, worded(r.error)));
+}
+
+async function steer(path) {
+  at("answer").textContent = "";
+  try {
+    await change(path);
+  } catch (error) {
+    at("answer").textContent = error instanceof Refused ? error.message : "the manager does not answer";
+  }
+  looks = 0;
+  dispatchEvent(new Event("embomatrix-changed"));
+}
