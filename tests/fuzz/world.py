@@ -20,6 +20,7 @@ from tests.fuzz.decoder import (
     text_of,
 )
 
+from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.scenes.scene_file import SceneFileError, read_scene
@@ -29,7 +30,7 @@ from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_ob
 from embomatrix.rpc.wire.rollout import skill_call_from_proto, skill_call_to_proto
 from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json, plan_to_json, plan_to_lines
 from embomatrix.skills.prompt import Codec, prompt_for, situation_of
-from embomatrix.world.bddl import BddlError, parse_formula, parse_problem, render_problem
+from embomatrix.world.bddl import ROOM_TYPES, BddlError, parse_formula, parse_problem, render_problem
 from embomatrix.world.bundle import decode_bundle, encode_bundle
 from embomatrix.world.bundle_head import HEAD, MAGIC, read_profiles
 from embomatrix.world.codec import asset_from_json, asset_to_json, scene_from_json, scene_to_json
@@ -171,6 +172,22 @@ def _scene(data: bytes) -> object:
     return scene
 
 
+def _house(data: bytes) -> object:
+    house = read_house(in_file("flat.toml", data))
+    assert {room.type for room in house.rooms} <= ROOM_TYPES
+    assert all(side > 0 for room in house.rooms for side in room.floor_m)
+    return house
+
+
+HOUSES = (
+    b'scene = "flat"\ndoors = [{rooms = ["kitchen_0", "outside"], width_m = 1.0}, {rooms = ["bar_0", "kitchen_0"]}]\n'
+    b"[rooms.kitchen_0]\nsize_m = [3.5, 3]\nwindows = 2\nfurniture = {fridge = 1, sofa-mnfbbh = 2}\n"
+    b"[rooms.bar_0]\nsize_m = [4, 3]\nheight_m = 2.6\n",
+    b'scene = "drawn"\ndoors = [{rooms = ["bar_0", "kitchen_0"]}]\n[rooms.kitchen_0]\nrect_m = [0, 0, 4, 3]\n'
+    b"[rooms.bar_0]\nrect_m = [4, 0, 8, 3]\n",
+)
+
+
 def _assets(data: bytes) -> object:
     (asset,) = read_assets(in_file("shelf/one.asset.json", data).parent).values()
     assert asset_from_json(json.loads(json.dumps(asset_to_json(asset)))) == asset
@@ -309,6 +326,13 @@ def table() -> dict[str, Decoder]:
             lambda: (scene,),
             frozenset({"factory.scenes.scene_file:read_scene", "world.records:convert"}),
             mutate_json,
+        ),
+        "house file": Decoder(
+            _house,
+            (HouseFileError,),
+            lambda: HOUSES,
+            frozenset({"factory.floorplan.house_file:read_house", "world.records:convert"}),
+            mutate_bytes,
         ),
         "asset file": Decoder(
             _assets,

@@ -112,6 +112,8 @@ _TEXTS = {
     "still.toml": "heartbeat_s = 0\n",
     "preferences.toml": "[preferences]\nhous = '18:00-08:00'\n",
     "scene.json": '{"rooms": [',
+    "window.toml": 'scene = "flat"\n[rooms.kitchen_0]\nsize_m = [3, 3]\nwindow = 2\n',
+    "doors.toml": 'scene = "flat"\ndoors = [{rooms = ["kitchen_0", "bar_0"]}]\n[rooms.kitchen_0]\nsize_m = [3, 3]\n',
     "empty_scene.json": "{}",
     "mesh.obj": "v 0 0 0\nf 1 2\nhello\n",
     "good.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n",
@@ -351,6 +353,30 @@ COMMANDS = (
         "no EAI tasks", "factory import --eai=FILES/empty --scene=Rs_int", "FILES/empty", "unpack the wheel"
     ),
     # Scenes, assets, factory
+    CommandCase(
+        "unknown key of a house file",
+        "scene build FILES/window.toml --out=FILES/new",
+        "window.toml: rooms.kitchen_0: found the key 'window'",
+        "expected only size_m",
+    ),
+    CommandCase(
+        "door of a house file to a room that it lacks",
+        "scene draw FILES/doors.toml",
+        "doors.toml: doors[0].rooms: found 'bar_0'",
+        "expected 'outside' or a room of the file",
+    ),
+    CommandCase(
+        "house file that is no TOML",
+        "scene check FILES/unfinished.toml",
+        "unfinished.toml is not TOML",
+        "correct that line",
+    ),
+    CommandCase(
+        "missing house file",
+        "scene show FILES/nothing.toml",
+        "nothing.toml",
+        "expected a floor plan in TOML",
+    ),
     CommandCase(
         "damaged scene file",
         "scene show FILES/scene.json",
