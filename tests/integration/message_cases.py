@@ -378,6 +378,18 @@ COMMANDS = (
         "expected a floor plan in TOML",
     ),
     CommandCase(
+        "damaged scene file for a build",
+        "factory build --scenes=FILES/scene.json --out=FILES/new",
+        "FILES/scene.json",
+        "expected a file that `embomatrix scene build` wrote",
+    ),
+    CommandCase(
+        "floor plan for an import",
+        "factory import --bddl=FILES/problem.bddl --scenes=FILES/window.toml",
+        "FILES/window.toml is a floor plan",
+        "build it with `embomatrix scene build FILES/window.toml`",
+    ),
+    CommandCase(
         "damaged scene file",
         "scene show FILES/scene.json",
         "FILES/scene.json",

@@ -40,7 +40,13 @@ from embomatrix.factory.days.model_days import ModelDays
 from embomatrix.factory.days.planning import plan_day
 from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
-from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
+from embomatrix.factory.pipeline.settings import (
+    DEFAULT_SCENES,
+    SCENE_EXTRACTOR,
+    BuildSettings,
+    WriterKind,
+)
+from embomatrix.factory.scenes.base_scenes import base_scenes
 from embomatrix.host.commands import command_group
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
@@ -108,20 +114,21 @@ def build(
         fail(
             "--llm and --cassette apply to layout agents here: select some, as in --agent room-organizer=llm"
         )
-    settings = BuildSettings(
-        train,
-        heldout,
-        seed,
-        scene_ids(scenes),
-        look_ahead=look_ahead,
-        physical=in_physics(physical, look_ahead=look_ahead),
-        modelled=tuple(sorted(model_backed)),
-    )
     with (
         user_errors(out, more=MODEL_ERRORS),
         layout_agents(model_backed, llm, model, key, cassette, FailureLimit()) as layout,
     ):
-        make_dataset(out, settings, jobs=jobs, layout=layout)
+        chosen = base_scenes(scenes or DEFAULT_SCENES)
+        settings = BuildSettings(
+            train,
+            heldout,
+            seed,
+            chosen.names,
+            look_ahead=look_ahead,
+            physical=in_physics(physical, look_ahead=look_ahead),
+            modelled=tuple(sorted(model_backed)),
+        )
+        make_dataset(out, settings, jobs=jobs, layout=layout, own=chosen.own)
 
 
 @app.command()
@@ -150,11 +157,18 @@ def generate(
     if look and kind is WriterKind.SOCIAL:
         fail("--look needs a language model: give --llm URL and --model NAME, or --cassette FILE")
     model_backed = model_backed_agents(forms)
+    with user_errors(out):
+        chosen = base_scenes(scenes or DEFAULT_SCENES)
+    if chosen.own:
+        fail(
+            f"the scene {next(iter(chosen.own))!r} comes from a file: `factory generate` takes names of base scenes only; "
+            "`factory build` and `factory import` take files too"
+        )
     settings = BuildSettings(
         tasks,
         heldout,
         seed,
-        scene_ids(scenes),
+        chosen.names,
         kind,
         look_ahead=look_ahead,
         physical=in_physics(physical, look_ahead=look_ahead),
