@@ -26,6 +26,7 @@ from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.scenes.scene_file import SceneFileError, read_scene
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.sources import ProblemSourceError, read_eai, read_file, read_jsonl
+from embomatrix.factory.task_import.task_file import read_task_file
 from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.rpc.wire.rollout import skill_call_from_proto, skill_call_to_proto
 from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json, plan_to_json, plan_to_lines
@@ -188,6 +189,21 @@ HOUSES = (
 )
 
 
+def _task_file(data: bytes) -> object:
+    file = read_task_file(in_file("tidy.toml", data))
+    assert parse_problem(file.source.text) == file.problem
+    use_goal(file.problem.goal, file.problem.types)
+    return file
+
+
+TASK_FILES = (
+    b'instruction = "Put it away."\nscene = "Rs_int"\ngoal = "(and (inside apple_1 fridge_1) (not (open fridge_1)))"\n'
+    b'[objects]\napple_1 = "ontop table_1"\ntable_1 = "inroom kitchen_0"\nfridge_1 = ["inroom kitchen", "not open"]\n',
+    b'instruction = "Tidy."\ngoal = "(forall (?m - mug.n.04) (ontop ?m floor_1))"\n[objects]\nmug_1 = []\nmug_2 = []\n'
+    b'floor_1 = "inroom kitchen"\n',
+)
+
+
 def _assets(data: bytes) -> object:
     (asset,) = read_assets(in_file("shelf/one.asset.json", data).parent).values()
     assert asset_from_json(json.loads(json.dumps(asset_to_json(asset)))) == asset
@@ -331,7 +347,14 @@ def table() -> dict[str, Decoder]:
             _house,
             (HouseFileError,),
             lambda: HOUSES,
-            frozenset({"factory.floorplan.house_file:read_house", "world.records:convert"}),
+            frozenset({"factory.toml_files:read_toml", "world.records:convert"}),
+            mutate_bytes,
+        ),
+        "task file": Decoder(
+            _task_file,
+            (ProblemSourceError, GoalError),
+            lambda: TASK_FILES,
+            frozenset({"factory.toml_files:read_toml", "world.records:convert"}),
             mutate_bytes,
         ),
         "asset file": Decoder(

@@ -112,6 +112,9 @@ _TEXTS = {
     "still.toml": "heartbeat_s = 0\n",
     "preferences.toml": "[preferences]\nhous = '18:00-08:00'\n",
     "scene.json": '{"rooms": [',
+    "on.toml": 'instruction = "i"\ngoal = "(open fridge_1)"\n[objects]\nfridge_1 = "on floor_1"\n',
+    "fridge.toml": 'instruction = "i"\ngoal = "(not (open fridge_1))"\n[objects]\nfridge_1 = "inroom kitchen"\n',
+    "pear.toml": 'instruction = "i"\ngoal = "(open pear_1)"\n[objects]\nfridge_1 = "inroom kitchen"\n',
     "window.toml": 'scene = "flat"\n[rooms.kitchen_0]\nsize_m = [3, 3]\nwindow = 2\n',
     "doors.toml": 'scene = "flat"\ndoors = [{rooms = ["kitchen_0", "bar_0"]}]\n[rooms.kitchen_0]\nsize_m = [3, 3]\n',
     "empty_scene.json": "{}",
@@ -376,6 +379,33 @@ COMMANDS = (
         "scene show FILES/nothing.toml",
         "nothing.toml",
         "expected a floor plan in TOML",
+    ),
+    CommandCase(
+        "unknown fact in a task file",
+        "factory try FILES/on.toml",
+        "on.toml: objects.fridge_1: found 'on floor_1'",
+        "facts such as 'inroom kitchen'",
+    ),
+    CommandCase(
+        "goal of a task file about an object that it lacks",
+        "factory try FILES/pear.toml",
+        "object 'pear_1' is not declared",
+        "add it to [objects], or correct its name",
+    ),
+    CommandCase(
+        "floor plan in place of a task file",
+        "factory try FILES/window.toml",
+        "window.toml: its top level: found the key 'rooms'",
+        "expected only instruction, goal, objects",
+    ),
+    CommandCase(
+        "missing task file", "factory try FILES/nothing.toml", "nothing.toml", "expected a task in TOML"
+    ),
+    CommandCase(
+        "trial in a folder of another dataset",
+        "factory try FILES/fridge.toml --out=KITCHEN",
+        "KITCHEN holds a dataset",
+        "name another folder with --out",
     ),
     CommandCase(
         "damaged scene file for a build",

@@ -151,7 +151,7 @@ MISTAKES = [
     ("[5.5, 0, 9, 3]", "[5.5, 0, 9, nan]", "rooms['kitchen_0'].rect_m[3]: found nan"),
     ("rect_m = [5.5, 0, 9, 3]", "size_m = [3, 3]", "rooms.kitchen_0: found size_m beside rooms with rect_m"),
     ("rect_m = [5.5, 0, 9, 3]", "rect_m = 1979-05-27", "rooms['kitchen_0'].rect_m: found datetime.date"),
-    ("[rooms.kitchen_0]", "[rooms.kitchn_0]", "rooms.kitchn_0: found 'kitchn_0': expected a room type"),
+    ("[rooms.kitchen_0]", "[rooms.kitchn_0]", "a room type and a number, such as kitchen_0; did you mean kitchen?"),
     ("[rooms.kitchen_0]", '[rooms."kitchen_٣"]', "expected a room type and a number"),
     ("[rooms.kitchen_0]", "[rooms.kitchen_0.rooms]", "rooms.kitchen_0: found the key 'rooms'"),
     ('scene = "drawn_flat"', "", "found no key 'scene'"),

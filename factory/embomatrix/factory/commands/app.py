@@ -34,6 +34,7 @@ from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scene
 from embomatrix.factory.commands.starter import starter
 from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
+from embomatrix.factory.commands.trial import try_
 from embomatrix.factory.commands.verification import verify
 from embomatrix.factory.days.maker import DAYS, days_planned_by
 from embomatrix.factory.days.model_days import ModelDays
@@ -56,6 +57,7 @@ app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
 app.command("list")(list_)
+app.command("try")(try_)
 for command in (
     agent,
     lay,

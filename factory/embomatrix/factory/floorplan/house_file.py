@@ -1,7 +1,6 @@
 """House files: floor plans that a person writes, with rooms, doors, windows and wishes for furniture, in TOML."""
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,10 @@ from msgspec import UNSET, Meta, UnsetType
 
 from embomatrix.factory.floorplan.spec import MIN_DOOR_M
 from embomatrix.factory.floorplan.walls import WALL_M, Rect, shared_edge
+from embomatrix.factory.toml_files import TomlFileError, check_keys, close_to, read_toml, wrong
 from embomatrix.world.bddl import ROOM_TYPES, is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.records import Record, SceneInvalidError, convert
-from embomatrix.world.whole_file import read_whole
 
 SUFFIX: Final = ".toml"
 MAX_BYTES: Final = 1024 * 1024
@@ -106,13 +105,9 @@ class HouseTable(Record):
 def read_house(path: Path) -> House:
     """Read and check a house file of at most MAX_BYTES. Raises HouseFileError."""
     try:
-        value = tomllib.loads(read_whole(path, at_most=MAX_BYTES).decode("utf-8"))
-    except OSError as error:
-        raise HouseFileError(
-            f"{path} can't be read ({error.strerror}): expected a floor plan in TOML"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise HouseFileError(f"{path} is not TOML ({error}): correct that line") from error
+        value = read_toml(path, at_most=MAX_BYTES, expected="a floor plan")
+    except TomlFileError as error:
+        raise HouseFileError(str(error)) from error
     try:
         _check_keys(value)
         house = _house(convert(value, HouseTable, _ROOT))
@@ -125,33 +120,21 @@ def read_house(path: Path) -> House:
 
 def _check_keys(value: Mapping[str, Any]) -> None:
     """Raise SceneInvalidError for a missing or unknown key. `convert` checks the values."""
-    _check_table("", value, HouseTable, needed=("scene", "rooms"))
+    check_keys("", value, HouseTable, needed=("scene", "rooms"))
     rooms, doors = value.get("rooms"), value.get("doors")
     for name, table in rooms.items() if isinstance(rooms, dict) else ():
-        _check_table(f"rooms.{name[:60]}", table, HouseRoomTable)
+        check_keys(f"rooms.{name[:60]}", table, HouseRoomTable)
     for number, table in enumerate(doors if isinstance(doors, list) else ()):
-        _check_table(f"doors[{number}]", table, HouseDoorTable, needed=("rooms",))
-
-
-def _check_table(key: str, table: object, kind: type[Record], *, needed: Sequence[str] = ()) -> None:
-    if not isinstance(table, dict):
-        return
-    known = ", ".join(kind.__struct_fields__)
-    for name in table:
-        if name not in kind.__struct_fields__:
-            raise _wrong(key or "its top level", f"the key {name[:60]!r}", f"only {known}")
-    for name in needed:
-        if name not in table:
-            raise _wrong(key or "its top level", f"no key {name!r}", f"the keys {known}")
+        check_keys(f"doors[{number}]", table, HouseDoorTable, needed=("rooms",))
 
 
 def _house(table: HouseTable) -> House:
     if not _NAME.match(table.scene):
-        raise _wrong("scene", repr(table.scene[:60]), "a name of up to 40 letters, digits and underscores")
+        raise wrong("scene", repr(table.scene[:60]), "a name of up to 40 letters, digits and underscores")
     if table.scene in Catalog.load().scene_ids:
-        raise _wrong("scene", f"{table.scene!r}, a base scene of the catalog", "a name of its own")
+        raise wrong("scene", f"{table.scene!r}, a base scene of the catalog", "a name of its own")
     if not 1 <= len(table.rooms) <= MAX_HOUSE_ROOMS:
-        raise _wrong(
+        raise wrong(
             "rooms", f"{len(table.rooms)} rooms", f"1 to {MAX_HOUSE_ROOMS} tables [rooms.TYPE_NUMBER]"
         )
     return House(
@@ -167,11 +150,11 @@ def _house(table: HouseTable) -> House:
 def _room(name: str, table: HouseRoomTable) -> HouseRoom:
     key = f"rooms.{name[:60]}"
     if not (is_room_instance(name) and name.isascii()):
-        types = ", ".join(sorted(ROOM_TYPES))
-        raise _wrong(key, repr(name[:60]), f"a room type and a number, such as kitchen_0; types: {types}")
+        hint = close_to(name.rstrip("_0123456789"), ROOM_TYPES)
+        raise wrong(key, repr(name[:60]), f"a room type and a number, such as kitchen_0; {hint}")
     if (table.size_m is UNSET) is (table.rect_m is UNSET):
         given = "neither size_m nor rect_m" if table.size_m is UNSET else "both size_m and rect_m"
-        raise _wrong(key, given, "one of them")
+        raise wrong(key, given, "one of them")
     rect = None if table.rect_m is UNSET else _rect(key, table.rect_m)
     if rect is not None:
         (x0, y0), (x1, y1) = rect.floor
@@ -198,7 +181,7 @@ def _rect(key: str, corners: tuple[float, float, float, float]) -> Rect:
     sides = (rect.x1 - rect.x0 - WALL_M, rect.y1 - rect.y0 - WALL_M)
     if not all(LEAST_SIDE_M - 1e-9 <= side <= MOST_SIDE_M for side in sides):
         floor = f"a floor of {sides[0]:.2f} x {sides[1]:.2f} m between the walls"
-        raise _wrong(
+        raise wrong(
             f"{key}.rect_m",
             f"{list(corners)}, {floor}",
             f"[x0, y0, x1, y1] in metres with sides of {LEAST_SIDE_M:g} to {MOST_SIDE_M:g} m",
@@ -223,7 +206,7 @@ def _ends(number: int, table: HouseDoorTable) -> tuple[str, str]:
     """Return the rooms of a door, the outside as an empty second name."""
     first, second = table.rooms
     if first == second:
-        raise _wrong(
+        raise wrong(
             f"doors[{number}].rooms", f"{first[:60]!r} twice", f"two rooms, or a room and {OUTSIDE!r}"
         )
     if first == OUTSIDE:
@@ -236,7 +219,7 @@ def _check_places(house: House) -> None:
     rects = house.rects
     if rects and len(rects) < len(house.rooms):
         free = next(room.name for room in house.rooms if room.rect is None)
-        raise _wrong(
+        raise wrong(
             f"rooms.{free}", "size_m beside rooms with rect_m", "rect_m for all rooms, or size_m for all"
         )
     names = list(rects)
@@ -244,9 +227,9 @@ def _check_places(house: House) -> None:
         for b in names[at + 1 :]:
             gap = _gap(rects[a], rects[b])
             if gap < -1e-6:
-                raise _wrong(f"rooms.{b}.rect_m", f"an overlap with {a}", "rectangles side by side")
+                raise wrong(f"rooms.{b}.rect_m", f"an overlap with {a}", "rectangles side by side")
             if 1e-6 < gap < 2 * WALL_M:
-                raise _wrong(
+                raise wrong(
                     f"rooms.{b}.rect_m",
                     f"a gap of {gap:.2f} m to {a}",
                     f"rooms that share the centre line of a wall, or at least {2 * WALL_M:g} m between them",
@@ -266,20 +249,20 @@ def _check_doors(house: House) -> None:
         key = f"doors[{number}].rooms"
         for name in door.rooms:
             if name and name not in known:
-                raise _wrong(key, repr(name[:60]), f"{OUTSIDE!r} or a room of the file: {', '.join(known)}")
+                raise wrong(key, repr(name[:60]), f"{OUTSIDE!r} or a room of the file: {', '.join(known)}")
         if not door.rooms[0]:
-            raise _wrong(key, f"{OUTSIDE!r} twice", "a room")
+            raise wrong(key, f"{OUTSIDE!r} twice", "a room")
         if frozenset(door.rooms) in seen:
-            raise _wrong(key, "a second door between the same rooms", "one door for two rooms")
+            raise wrong(key, "a second door between the same rooms", "one door for two rooms")
         seen.add(frozenset(door.rooms))
         _check_wall(key, house.rects, door)
     if sum(not door.rooms[1] for door in house.doors) > 1:
-        raise _wrong("doors", f"several doors to {OUTSIDE!r}", "one front door")
+        raise wrong("doors", f"several doors to {OUTSIDE!r}", "one front door")
     inner = [door.rooms for door in house.doors if door.rooms[1]]
     if house.rects and not inner and len(known) > 1:
-        raise _wrong("doors", "none", "the doors between rooms with rect_m, as tables [[doors]]")
+        raise wrong("doors", "none", "the doors between rooms with rect_m, as tables [[doors]]")
     if inner and (shut := unreached(known, inner)):
-        raise _wrong("doors", f"no way from {known[0]} to {', '.join(shut)}", "doors that join all rooms")
+        raise wrong("doors", f"no way from {known[0]} to {', '.join(shut)}", "doors that join all rooms")
 
 
 def _check_wall(key: str, rects: Mapping[str, Rect], door: HouseDoor) -> None:
@@ -289,7 +272,7 @@ def _check_wall(key: str, rects: Mapping[str, Rect], door: HouseDoor) -> None:
     edge = shared_edge(rects[a], rects[b])
     if edge is None or edge.length < door.needs_m:
         shared = "no wall" if edge is None else f"{edge.length:.2f} m of wall"
-        raise _wrong(key, f"{shared} between {a} and {b}", f"at least {door.needs_m:.2f} m for this door")
+        raise wrong(key, f"{shared} between {a} and {b}", f"at least {door.needs_m:.2f} m for this door")
 
 
 def unreached(rooms: Sequence[str], doors: Iterable[tuple[str, str]]) -> list[str]:
@@ -302,7 +285,3 @@ def unreached(rooms: Sequence[str], doors: Iterable[tuple[str, str]]) -> list[st
         reached |= beyond
         waiting += beyond
     return [name for name in rooms if name not in reached]
-
-
-def _wrong(key: str, found: str, expected: str) -> SceneInvalidError:
-    return SceneInvalidError(key, f"found {found}: expected {expected}")
