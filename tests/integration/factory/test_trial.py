@@ -106,6 +106,23 @@ def test_refusal_names_the_check_and_what_passed_before(
     assert not (tmp_path / "tried").exists()
 
 
+def test_substance_that_the_goal_names_is_wiped_off_or_refused(tmp_path: Path) -> None:
+    text = """instruction = "Wipe the table."
+scene = "Benevolence_1_int"
+goal = "(not (covered breakfast_table_1 dust.n.01))"
+[objects]
+breakfast_table_1 = ["inroom dining_room", "covered dust.n.01"]
+rag_1 = "ontop breakfast_table_1"
+"""
+    code, output = run(written(tmp_path, text), "--out", tmp_path / "tried")
+    assert code == 0, output
+    assert "clean_object_with_tool breakfast_table_1 rag_1" in output
+    filled = text.replace("(not (covered breakfast_table_1 dust.n.01))", "(filled rag_1 water.n.06)")
+    code, output = run(written(tmp_path, filled), "--out", tmp_path / "tried")
+    assert code == 1, output
+    assert "✗ text: " in output
+
+
 def test_second_trial_replaces_the_first_and_leaves_other_datasets(tmp_path: Path) -> None:
     out = tmp_path / "tried"
     assert run(written(tmp_path, TIDY), "--out", out)[0] == 0

@@ -74,6 +74,13 @@ def test_scene_file_lies_beside_the_task_file(tmp_path: Path) -> None:
     assert file.scene == str(tmp_path / "scenes" / "flat.json")
 
 
+def test_substances_need_no_declaration(tmp_path: Path) -> None:
+    text = """instruction = "i"\ngoal = "(not (covered table_1 dust.n.01))"\n[objects]\ntable_1 = "covered dust.n.01"\n"""
+    problem = read_problem(read(tmp_path, text).source)[0]
+    assert problem.objects == {"table_1": "table.n.02", "dust.n.01": "dust.n.01"}
+    assert render(problem.goal) == "(not (covered table_1 dust.n.01))"
+
+
 def test_quantifiers_range_over_the_objects_of_a_type(tmp_path: Path) -> None:
     goal = "(forall (?m - mug.n.04) (ontop ?m coffee_table_1))"
     file = read(
@@ -103,6 +110,7 @@ MISTAKES = [
     ("apple_1 = ", "aple_1 = ", "objects.aple_1: unknown category 'aple'"),
     ("apple_1 = ", "apple = ", "objects.apple: found 'apple': expected a category and a number"),
     ("apple_1 = ", '"Apple 1" = ', "objects.Apple 1: found 'Apple 1': expected a category and a number"),
+    ("apple_1 = ", "agent_1 = ", "objects.agent_1: found 'agent_1': expected things only"),
     ("ontop table_1", "on table_1", "objects.apple_1: found 'on table_1': unknown predicate 'on'"),
     ("ontop table_1", "ontop desk_1", "objects.apple_1: found 'ontop desk_1': object 'desk_1' is not declared"),
     ("ontop table_1", "", "objects.apple_1: found '': expected facts such as 'inroom kitchen'"),

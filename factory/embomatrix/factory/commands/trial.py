@@ -23,9 +23,10 @@ from embomatrix.factory.task_import.trial import STAGES, TaskTrial, TrialStage, 
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
+from embomatrix.sim.state.facts import FactError
 from embomatrix.world.bundle import Bundle, decode_bundle
 from embomatrix.world.dataset import BUNDLES_FOLDER, TASKS_FILE, Dataset, bundle_file, write_dataset
-from embomatrix.world.evaluate import scored_atoms
+from embomatrix.world.evaluate import GoalError, scored_atoms
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import check_writable, write_whole
 
@@ -81,7 +82,10 @@ def try_(
     with user_errors(page):
         if page is not None:
             check_writable(page)
-    with user_errors(folder), contextlib.closing(PlacementLibrary()) as library:
+    with (
+        user_errors(folder, more=(FactError, GoalError)),
+        contextlib.closing(PlacementLibrary()) as library,
+    ):
         trial = try_task(task_file, base, library, ReachabilitySurvey() if physical else None, seed=seed)
         _report(file, task_file, base, trial)
         if isinstance(trial.outcome, TaskRefusal):
@@ -99,14 +103,16 @@ def try_(
             )
             write_whole(page, html.encode("utf-8"))
     say(f"{time.monotonic() - began:.1f} s. Play it, or look at it in a browser:")
-    task_id = trial.outcome.record.task.task_id
-    place = shlex.quote(str(folder))
-    say(f"  embomatrix play {task_id} --dataset {place} --interactive")
-    say(f"  embomatrix play {task_id} --dataset {place} --oracle")
-    if page is None:
-        say(f"  embomatrix factory inspect {task_id} --dataset {place} --out {task_file.source.name}.html")
-    else:
-        say(f"  {page}")
+    _say_commands(trial.outcome.record.task.task_id, folder, task_file.source.name, page)
+
+
+def _say_commands(task_id: str, folder: Path, name: str, page: Path | None) -> None:
+    """Print the commands that play the task, and its page or the command that writes one."""
+    place = f"--dataset {shlex.quote(str(folder))}"
+    say(f"  embomatrix play {task_id} {place} --interactive")
+    say(f"  embomatrix play {task_id} {place} --oracle")
+    out = shlex.quote(f"{name}.html")
+    say(f"  embomatrix factory inspect {task_id} {place} --out {out}" if page is None else f"  {page}")
 
 
 def _report(file: Path, task_file: TaskFile, base: Scene, trial: TaskTrial) -> None:

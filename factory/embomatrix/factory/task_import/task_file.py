@@ -8,8 +8,8 @@ from typing import Annotated, Final
 
 from msgspec import Meta
 
-from embomatrix.factory.task_import.dialects import LAMPS, read_problem
-from embomatrix.factory.task_import.expressible import FLOORS
+from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.sources import ProblemSourceError, SourceText, read_file
 from embomatrix.factory.toml_files import TomlFileError, check_keys, close_to, read_toml, wrong
 from embomatrix.world.bddl import (
@@ -112,6 +112,8 @@ def _kind(name: str) -> tuple[str, str]:
     if match is None:
         raise wrong(key, repr(name[:60]), "a category and a number, such as apple_1 or coffee_table_2")
     catalog, word = Catalog.load(), match[1]
+    if f"{word}.n.01" == AGENT:
+        raise wrong(key, repr(name), "things only: a goal is never about the robot, which has its own place")
     try:
         synset = catalog.synset_of(word)
     except CatalogError as error:
@@ -119,7 +121,7 @@ def _kind(name: str) -> tuple[str, str]:
         if not found:
             raise SceneInvalidError(key, str(error)) from error
         return found, ""
-    return synset, "" if synset in FLOORS or synset in LAMPS else word
+    return synset, "" if synset in FLOORS else word
 
 
 def _synset_of(catalog: Catalog, word: str) -> str:
