@@ -205,8 +205,21 @@ def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
     assert len(base_scenes(["all"]).names) == 51
 
 
-def test_generate_names_the_commands_that_take_files(file: Path, tmp_path: Path) -> None:
-    code, output = run("generate", "--out", tmp_path / "days", "--scenes", file)
+def test_people_of_a_house_of_ones_own_ask_for_things(file: Path, house: Scene, tmp_path: Path) -> None:
+    line = ("generate", "--tasks", 2, "--scenes", file, *QUICK)
+    code, output = run(*line, "--out", tmp_path / "days")
+    assert code == 0, output
+    dataset = Dataset.load(tmp_path / "days")
+    for record in dataset.records:
+        assert record.task.task_id.startswith("two_bedroom_flat-train-")
+        assert dataset.bundle(record.bundle_digest).scene.rooms == house.rooms
+    assert_solved(dataset, dataset.records[0])
+    assert read_scene(tmp_path / "days" / SCENES_FOLDER / "two_bedroom_flat.json") == house
+
+
+def test_views_of_a_scene_file_are_not_shown_to_a_model(file: Path, tmp_path: Path) -> None:
+    line = ("generate", "--out", tmp_path / "days", "--scenes", file, "--look")
+    code, output = run(*line, "--llm", "http://127.0.0.1:1/v1", "--model", "none")
     assert code == 2
-    assert "'two_bedroom_flat' comes from a file" in output
+    assert "'two_bedroom_flat' comes from a file: --look shows scenes of the catalog only" in output
     assert not (tmp_path / "days").exists()

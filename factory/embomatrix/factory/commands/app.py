@@ -161,10 +161,9 @@ def generate(
     model_backed = model_backed_agents(forms)
     with user_errors(out):
         chosen = base_scenes(scenes or DEFAULT_SCENES)
-    if chosen.own:
+    if look and chosen.own:
         fail(
-            f"the scene {next(iter(chosen.own))!r} comes from a file: `factory generate` takes names of base scenes only; "
-            "`factory build` and `factory import` take files too"
+            f"the scene {next(iter(chosen.own))!r} comes from a file: --look shows scenes of the catalog only; leave it out"
         )
     settings = BuildSettings(
         tasks,
@@ -185,7 +184,14 @@ def generate(
         layout = stack.enter_context(layout_agents(model_backed, llm, model, key, cassette, FailureLimit()))
         if kind is WriterKind.SOCIAL:
             making = DAYS if layout is None else days_planned_by(partial(plan_day, agents=layout))
-            make_dataset(out, settings, jobs=jobs if layout is None else 1, check=check, making=making)
+            make_dataset(
+                out,
+                settings,
+                jobs=jobs if layout is None else 1,
+                check=check,
+                making=making,
+                own=chosen.own,
+            )
             return
         writer, ledger = stack.enter_context(
             model_request_writer(
@@ -200,7 +206,7 @@ def generate(
             )
         )
         making = days_planned_by(ModelDays(writer, layout).plan)
-        summary = make_dataset(out, settings, jobs=1, check=check, making=making)
+        summary = make_dataset(out, settings, jobs=1, check=check, making=making, own=chosen.own)
         _print_account(ledger, sum(map(summary.total, ("train", "heldout"))))
 
 

@@ -11,7 +11,7 @@ Scenes = Annotated[
     typer.Option(
         "--scenes",
         "--scene",
-        help="Base scene, 'all', or a .json file of `scene build` (not for `generate`). Repeat the option for more scenes.",
+        help="Base scene, 'all', or a .json file of `scene build`. Repeat the option for more scenes.",
     ),
 ]
 LookAhead = Annotated[

@@ -10,6 +10,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Protocol
@@ -135,7 +136,8 @@ class Maker(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Making:
-    """Way in which variants are made. ``begin`` starts a maker from the settings, in each process of the build.
+    """Way in which variants are made. ``begin`` starts a maker from the settings, in each process of the build. Scenes of
+    files are its argument ``own``.
 
     If ``whole_scenes``, the held-out tasks lie in scenes of their own, otherwise in rooms of their own. ``tasks`` is the
     number of tasks that a variant should yield. ``most`` is the largest share of a category; None makes
@@ -209,7 +211,7 @@ def build_dataset(
     """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted tasks.
 
     ``making`` replaces the maker of variants. ``own`` are scenes of files by their names in the settings; the folder keeps
-    them. Only the usual maker takes them.
+    them.
 
     ``check`` is a second check of each variant, such as a cluster. ``writer`` and ``layout`` replace the writer of
     the settings and the rule-based layout agents; they run in this process. Otherwise ``jobs`` processes are used.
@@ -235,10 +237,11 @@ def build_dataset(
     here = writer is not None or layout is not None
     if making is None:
         making = Making(VariantMaker)
-        begin_with: tuple[object, ...] = (settings, writer, layout, dict(own))
+        begin_with: tuple[object, ...] = (settings, writer, layout)
     else:
         begin_with = (settings,)
-    with shared_work(1 if here else jobs, making.begin, _make, *begin_with, died=died) as make:
+    begin = partial(making.begin, own=dict(own)) if own else making.begin
+    with shared_work(1 if here else jobs, begin, _make, *begin_with, died=died) as make:
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
             orders = _SplitOrders(store, bases, rooms[split], split, target, making)
             while round_orders := orders.next_round():
