@@ -86,6 +86,8 @@ wheel: $(VENV)/.dev
 
 pictures: $(VENV)/.dev
 	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --out docs/pictures
+	$(BIN)/embomatrix scene draw docs/examples/two_bedroom_flat.toml --out build/pictures
+	cp build/pictures/two_bedroom_flat_plan.png docs/pictures/
 	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --out docs/pictures
 	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures
 	$(BIN)/embomatrix scene draw --as relations --out docs/pictures

@@ -20,16 +20,18 @@ from tests.fuzz.decoder import (
     text_of,
 )
 
+from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.scenes.scene_file import SceneFileError, read_scene
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.sources import ProblemSourceError, read_eai, read_file, read_jsonl
+from embomatrix.factory.task_import.task_file import read_task_file
 from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.rpc.wire.rollout import skill_call_from_proto, skill_call_to_proto
 from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json, plan_to_json, plan_to_lines
 from embomatrix.skills.prompt import Codec, prompt_for, situation_of
-from embomatrix.world.bddl import BddlError, parse_formula, parse_problem, render_problem
+from embomatrix.world.bddl import ROOM_TYPES, BddlError, parse_formula, parse_problem, render_problem
 from embomatrix.world.bundle import decode_bundle, encode_bundle
 from embomatrix.world.bundle_head import HEAD, MAGIC, read_profiles
 from embomatrix.world.codec import asset_from_json, asset_to_json, scene_from_json, scene_to_json
@@ -171,6 +173,37 @@ def _scene(data: bytes) -> object:
     return scene
 
 
+def _house(data: bytes) -> object:
+    house = read_house(in_file("flat.toml", data))
+    assert {room.type for room in house.rooms} <= ROOM_TYPES
+    assert all(side > 0 for room in house.rooms for side in room.floor_m)
+    return house
+
+
+HOUSES = (
+    b'scene = "flat"\ndoors = [{rooms = ["kitchen_0", "outside"], width_m = 1.0}, {rooms = ["bar_0", "kitchen_0"]}]\n'
+    b"[rooms.kitchen_0]\nsize_m = [3.5, 3]\nwindows = 2\nfurniture = {fridge = 1, sofa-mnfbbh = 2}\n"
+    b"[rooms.bar_0]\nsize_m = [4, 3]\nheight_m = 2.6\n",
+    b'scene = "drawn"\ndoors = [{rooms = ["bar_0", "kitchen_0"]}]\n[rooms.kitchen_0]\nrect_m = [0, 0, 4, 3]\n'
+    b"[rooms.bar_0]\nrect_m = [4, 0, 8, 3]\n",
+)
+
+
+def _task_file(data: bytes) -> object:
+    file = read_task_file(in_file("tidy.toml", data))
+    assert parse_problem(file.source.text) == file.problem
+    use_goal(file.problem.goal, file.problem.types)
+    return file
+
+
+TASK_FILES = (
+    b'instruction = "Put it away."\nscene = "Rs_int"\ngoal = "(and (inside apple_1 fridge_1) (not (open fridge_1)))"\n'
+    b'[objects]\napple_1 = "ontop table_1"\ntable_1 = "inroom kitchen_0"\nfridge_1 = ["inroom kitchen", "not open"]\n',
+    b'instruction = "Tidy."\ngoal = "(forall (?m - mug.n.04) (ontop ?m floor_1))"\n[objects]\nmug_1 = []\nmug_2 = []\n'
+    b'floor_1 = "inroom kitchen"\n',
+)
+
+
 def _assets(data: bytes) -> object:
     (asset,) = read_assets(in_file("shelf/one.asset.json", data).parent).values()
     assert asset_from_json(json.loads(json.dumps(asset_to_json(asset)))) == asset
@@ -309,6 +342,20 @@ def table() -> dict[str, Decoder]:
             lambda: (scene,),
             frozenset({"factory.scenes.scene_file:read_scene", "world.records:convert"}),
             mutate_json,
+        ),
+        "house file": Decoder(
+            _house,
+            (HouseFileError,),
+            lambda: HOUSES,
+            frozenset({"factory.toml_files:read_toml", "world.records:convert"}),
+            mutate_bytes,
+        ),
+        "task file": Decoder(
+            _task_file,
+            (ProblemSourceError, GoalError),
+            lambda: TASK_FILES,
+            frozenset({"factory.toml_files:read_toml", "world.records:convert"}),
+            mutate_bytes,
         ),
         "asset file": Decoder(
             _assets,

@@ -112,6 +112,11 @@ _TEXTS = {
     "still.toml": "heartbeat_s = 0\n",
     "preferences.toml": "[preferences]\nhous = '18:00-08:00'\n",
     "scene.json": '{"rooms": [',
+    "on.toml": 'instruction = "i"\ngoal = "(open fridge_1)"\n[objects]\nfridge_1 = "on floor_1"\n',
+    "fridge.toml": 'instruction = "i"\ngoal = "(not (open fridge_1))"\n[objects]\nfridge_1 = "inroom kitchen"\n',
+    "pear.toml": 'instruction = "i"\ngoal = "(open pear_1)"\n[objects]\nfridge_1 = "inroom kitchen"\n',
+    "window.toml": 'scene = "flat"\n[rooms.kitchen_0]\nsize_m = [3, 3]\nwindow = 2\n',
+    "doors.toml": 'scene = "flat"\ndoors = [{rooms = ["kitchen_0", "bar_0"]}]\n[rooms.kitchen_0]\nsize_m = [3, 3]\n',
     "empty_scene.json": "{}",
     "mesh.obj": "v 0 0 0\nf 1 2\nhello\n",
     "good.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n",
@@ -351,6 +356,69 @@ COMMANDS = (
         "no EAI tasks", "factory import --eai=FILES/empty --scene=Rs_int", "FILES/empty", "unpack the wheel"
     ),
     # Scenes, assets, factory
+    CommandCase(
+        "unknown key of a house file",
+        "scene build FILES/window.toml --out=FILES/new",
+        "window.toml: rooms.kitchen_0: found the key 'window'",
+        "expected only size_m",
+    ),
+    CommandCase(
+        "door of a house file to a room that it lacks",
+        "scene draw FILES/doors.toml",
+        "doors.toml: doors[0].rooms: found 'bar_0'",
+        "expected 'outside' or a room of the file",
+    ),
+    CommandCase(
+        "house file that is no TOML",
+        "scene check FILES/unfinished.toml",
+        "unfinished.toml is not TOML",
+        "correct that line",
+    ),
+    CommandCase(
+        "missing house file",
+        "scene show FILES/nothing.toml",
+        "nothing.toml",
+        "expected a floor plan in TOML",
+    ),
+    CommandCase(
+        "unknown fact in a task file",
+        "factory try FILES/on.toml",
+        "on.toml: objects.fridge_1: found 'on floor_1'",
+        "facts such as 'inroom kitchen'",
+    ),
+    CommandCase(
+        "goal of a task file about an object that it lacks",
+        "factory try FILES/pear.toml",
+        "object 'pear_1' is not declared",
+        "add it to [objects], or correct its name",
+    ),
+    CommandCase(
+        "floor plan in place of a task file",
+        "factory try FILES/window.toml",
+        "window.toml: its top level: found the key 'rooms'",
+        "expected only instruction, goal, objects",
+    ),
+    CommandCase(
+        "missing task file", "factory try FILES/nothing.toml", "nothing.toml", "expected a task in TOML"
+    ),
+    CommandCase(
+        "trial in a folder of another dataset",
+        "factory try FILES/fridge.toml --out=KITCHEN",
+        "KITCHEN holds a dataset",
+        "name another folder with --out",
+    ),
+    CommandCase(
+        "damaged scene file for a build",
+        "factory build --scenes=FILES/scene.json --out=FILES/new",
+        "FILES/scene.json",
+        "expected a file that `embomatrix scene build` wrote",
+    ),
+    CommandCase(
+        "floor plan for an import",
+        "factory import --bddl=FILES/problem.bddl --scenes=FILES/window.toml",
+        "FILES/window.toml is a floor plan",
+        "build it with `embomatrix scene build FILES/window.toml`",
+    ),
     CommandCase(
         "damaged scene file",
         "scene show FILES/scene.json",

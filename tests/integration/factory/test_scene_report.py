@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.check import STABLE_SHARE, ProblemKind, check_scene, check_settled
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, report_of, report_on, report_table, unaccounted
+from embomatrix.factory.scenes.scene_file import read_scene
 from embomatrix.host.limits import usable_cores
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 SMALL = "hotel_suite_small"
+PAGE = Path(__file__).parents[3] / "docs" / "scenes.md"
 
 
 def put(scene: Scene, name: str, x: float, y: float, z: float | None = None) -> Scene:
@@ -180,8 +183,67 @@ def test_names_and_all_exclude_one_another(arguments: list[str], words: str) -> 
 
 
 def test_page_names_every_rule() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "scenes.md").read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     assert [kind.value for kind in ProblemKind if f"`{kind.value}`" not in page] == []
+
+
+def test_house_on_the_page_is_built_checked_and_drawn_by_the_commands_on_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    (printed,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    file = Path("docs/examples/two_bedroom_flat.toml")
+    assert printed == (PAGE.parents[1] / file).read_text(encoding="utf-8")
+    (tmp_path / file.parent).mkdir(parents=True)
+    (tmp_path / file).write_text(printed, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(r"^embomatrix scene (\w+ [^#\n]*two_bedroom_flat[^#\n]*)", page, re.MULTILINE)
+    assert [command.split()[0] for command in commands] == ["build", "check", "draw", "draw"]
+    for command in commands:
+        done = CliRunner().invoke(app, command.split())
+        assert done.exit_code == 0, done.output
+    scene = read_scene(Path("scenes/two_bedroom_flat.json"))
+    assert {room.name for room in scene.rooms} == set(re.findall(r"^\[rooms\.(\w+)\]", printed, re.MULTILINE))
+    assert Path("pictures/two_bedroom_flat_plan.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_build_of_a_house_names_what_has_no_place_and_counts_it(tmp_path: Path) -> None:
+    house = tmp_path / "hall.toml"
+    house.write_text(
+        'scene = "hall"\n[rooms.corridor_0]\nsize_m = [4, 1.5]\nfurniture = {pool_table = 1, picture = 1}\n',
+        encoding="utf-8",
+    )
+    report = tmp_path / "report.json"
+    done = CliRunner().invoke(
+        app, ["build", str(house), "--seed", "2", "--out", str(tmp_path), "--report", str(report)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "left out of hall: 1 pool_table-" in done.output
+    (entry,) = json.loads(report.read_text())
+    assert (entry["scene_id"], entry["seed"], entry["listed"], entry["placed"]) == ("hall", 2, 2, 1)
+    assert read_scene(tmp_path / "hall.json").seed == 2
+
+
+def test_two_house_files_of_one_name_are_refused(tmp_path: Path) -> None:
+    for name in ("a.toml", "b.toml"):
+        (tmp_path / name).write_text('scene = "hut"\n[rooms.kitchen_0]\nsize_m = [3, 3]\n', encoding="utf-8")
+    done = CliRunner().invoke(
+        app, ["build", str(tmp_path / "a.toml"), str(tmp_path / "b.toml"), "--out", str(tmp_path / "out")]
+    )
+    assert done.exit_code == 2
+    assert "both describe the scene 'hut': change `scene` in one of them" in done.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_house_with_impossible_doors_ends_in_a_sentence(tmp_path: Path) -> None:
+    around = "".join(f"[rooms.bedroom_{n}]\nsize_m = [9, 9]\n" for n in range(9))
+    doors = ", ".join(f'{{rooms = ["closet_0", "bedroom_{n}"]}}' for n in range(9))
+    house = tmp_path / "star.toml"
+    house.write_text(f'scene = "star"\ndoors = [{doors}]\n[rooms.closet_0]\nsize_m = [1, 1]\n{around}')
+    done = CliRunner().invoke(app, ["build", str(house), "--out", str(tmp_path)])
+    assert done.exit_code == 1
+    assert "most often has no wall" in done.output
+    assert "Traceback" not in done.output
 
 
 @pytest.mark.slow

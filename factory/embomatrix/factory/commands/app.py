@@ -34,13 +34,20 @@ from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scene
 from embomatrix.factory.commands.starter import starter
 from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
+from embomatrix.factory.commands.trial import try_
 from embomatrix.factory.commands.verification import verify
 from embomatrix.factory.days.maker import DAYS, days_planned_by
 from embomatrix.factory.days.model_days import ModelDays
 from embomatrix.factory.days.planning import plan_day
 from embomatrix.factory.pipeline.build import VariantCheck
 from embomatrix.factory.pipeline.cluster import cluster_check
-from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
+from embomatrix.factory.pipeline.settings import (
+    DEFAULT_SCENES,
+    SCENE_EXTRACTOR,
+    BuildSettings,
+    WriterKind,
+)
+from embomatrix.factory.scenes.base_scenes import base_scenes
 from embomatrix.host.commands import command_group
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
@@ -50,6 +57,7 @@ app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
 app.command("list")(list_)
+app.command("try")(try_)
 for command in (
     agent,
     lay,
@@ -108,20 +116,21 @@ def build(
         fail(
             "--llm and --cassette apply to layout agents here: select some, as in --agent room-organizer=llm"
         )
-    settings = BuildSettings(
-        train,
-        heldout,
-        seed,
-        scene_ids(scenes),
-        look_ahead=look_ahead,
-        physical=in_physics(physical, look_ahead=look_ahead),
-        modelled=tuple(sorted(model_backed)),
-    )
     with (
         user_errors(out, more=MODEL_ERRORS),
         layout_agents(model_backed, llm, model, key, cassette, FailureLimit()) as layout,
     ):
-        make_dataset(out, settings, jobs=jobs, layout=layout)
+        chosen = base_scenes(scenes or DEFAULT_SCENES)
+        settings = BuildSettings(
+            train,
+            heldout,
+            seed,
+            chosen.names,
+            look_ahead=look_ahead,
+            physical=in_physics(physical, look_ahead=look_ahead),
+            modelled=tuple(sorted(model_backed)),
+        )
+        make_dataset(out, settings, jobs=jobs, layout=layout, own=chosen.own)
 
 
 @app.command()
@@ -150,11 +159,17 @@ def generate(
     if look and kind is WriterKind.SOCIAL:
         fail("--look needs a language model: give --llm URL and --model NAME, or --cassette FILE")
     model_backed = model_backed_agents(forms)
+    with user_errors(out):
+        chosen = base_scenes(scenes or DEFAULT_SCENES)
+    if look and chosen.own:
+        fail(
+            f"the scene {next(iter(chosen.own))!r} comes from a file: --look shows scenes of the catalog only; leave it out"
+        )
     settings = BuildSettings(
         tasks,
         heldout,
         seed,
-        scene_ids(scenes),
+        chosen.names,
         kind,
         look_ahead=look_ahead,
         physical=in_physics(physical, look_ahead=look_ahead),
@@ -169,7 +184,14 @@ def generate(
         layout = stack.enter_context(layout_agents(model_backed, llm, model, key, cassette, FailureLimit()))
         if kind is WriterKind.SOCIAL:
             making = DAYS if layout is None else days_planned_by(partial(plan_day, agents=layout))
-            make_dataset(out, settings, jobs=jobs if layout is None else 1, check=check, making=making)
+            make_dataset(
+                out,
+                settings,
+                jobs=jobs if layout is None else 1,
+                check=check,
+                making=making,
+                own=chosen.own,
+            )
             return
         writer, ledger = stack.enter_context(
             model_request_writer(
@@ -184,7 +206,7 @@ def generate(
             )
         )
         making = days_planned_by(ModelDays(writer, layout).plan)
-        summary = make_dataset(out, settings, jobs=1, check=check, making=making)
+        summary = make_dataset(out, settings, jobs=1, check=check, making=making, own=chosen.own)
         _print_account(ledger, sum(map(summary.total, ("train", "heldout"))))
 
 

@@ -1,6 +1,8 @@
 """Build of a dataset with progress bars and a summary, for the commands that write datasets."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from embomatrix.factory.commands.language_model import MODEL_ERRORS
 from embomatrix.factory.commands.options import processes
@@ -9,6 +11,7 @@ from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.build import BuildSummary, Making, VariantCheck, build_dataset
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.writer.tasks import TaskWriter
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
 
 
@@ -20,6 +23,7 @@ def make_dataset(
     check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
     making: Making | None = None,
+    own: Mapping[str, Scene] = MappingProxyType({}),
 ) -> BuildSummary:
     """Build the dataset with progress bars, print a summary and return it. Exit if it has too few tasks."""
     kept = f": finished tasks are kept in {out}; run the same command again to resume"
@@ -37,6 +41,7 @@ def make_dataset(
             check,
             layout,
             making,
+            own,
         )
     _print_summary(summary)
     say(f"dataset: {out}")

@@ -23,7 +23,7 @@ from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName
 from embomatrix.factory.layout.generator import lay as lay_by_tree
 from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
 from embomatrix.factory.pictures.scene import draw_plan
-from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.base_scenes import base_scenes
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import read_activity, read_file
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
@@ -34,7 +34,7 @@ Out = Annotated[
 
 
 def lay(
-    scene: Annotated[str, typer.Option(help="Base scene.")],
+    scene: Annotated[str, typer.Option(help="Base scene, or a .json file of `scene build`.")],
     bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
     activity: Annotated[str, typer.Option(help="An activity of the bddl package.")] = "",
     method: Annotated[LayoutMethod, typer.Option(help="Layout method.")] = LayoutMethod.TREE,
@@ -56,6 +56,9 @@ def lay(
         layout_agents(names, llm, model, key, cassette) as agents,
         poses.methods() as methods,
     ):
+        chosen = base_scenes([scene])
+        if len(chosen.names) > 1:
+            fail(f"--scene {scene} stands for {len(chosen.names)} scenes: name one of them")
         source = read_file(bddl) if bddl is not None else read_activity(activity)
         layouts: list[Layout] = []
 
@@ -67,7 +70,7 @@ def lay(
             return layouts[-1]
 
         imported = import_problem(
-            source, build_base_scene(scene), seed=seed, options=ImportOptions(lay=lay_and_keep)
+            source, chosen.built_all()[0], seed=seed, options=ImportOptions(lay=lay_and_keep)
         )
         for layout in layouts:
             _show(layout)

@@ -8,7 +8,11 @@ import typer
 Seed = Annotated[int, typer.Option(min=0, help="Random seed. Equal seeds give equal results.")]
 Scenes = Annotated[
     list[str] | None,
-    typer.Option("--scenes", "--scene", help="Base scene, or 'all'. Repeat the option for more scenes."),
+    typer.Option(
+        "--scenes",
+        "--scene",
+        help="Base scene, 'all', or a .json file of `scene build`. Repeat the option for more scenes.",
+    ),
 ]
 LookAhead = Annotated[
     bool,

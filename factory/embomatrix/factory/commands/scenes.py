@@ -15,6 +15,8 @@ from PIL import Image
 from rich.console import Console
 
 from embomatrix.factory.commands.terminal import check_output, fail, progress, say, show_table, user_errors
+from embomatrix.factory.floorplan.house_file import SUFFIX as HOUSE_SUFFIX
+from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
 from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
@@ -22,7 +24,7 @@ from embomatrix.factory.pictures.relations import draw_relations
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import draw_eyes, draw_sheet, draw_views
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
-from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.build import build_base_scene, build_house
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.host.commands import command_group
@@ -44,14 +46,21 @@ class Drawing(StrEnum):
     RELATIONS = "relations"
 
 
-SceneIds = Annotated[list[str] | None, typer.Argument(help="Names of scenes; none with --all.")]
+SceneIds = Annotated[
+    list[str] | None,
+    typer.Argument(help="Names of scenes, or .toml files of floor plans (docs/scenes.md); none with --all."),
+]
 SceneSource = Annotated[
     str,
-    typer.Argument(help="Name of a scene (see `embomatrix scene list`), or a .json file of `scene build`."),
+    typer.Argument(
+        help="Name of a scene (see `embomatrix scene list`), a .json file of `scene build`, or a .toml file of a floor plan."
+    ),
 ]
 SceneSources = Annotated[
     list[str] | None,
-    typer.Argument(help="Names of scenes, or .json files of `scene build`; none with --all."),
+    typer.Argument(
+        help="Names of scenes, .json files of `scene build`, or .toml files of floor plans; none with --all."
+    ),
 ]
 All = Annotated[bool, typer.Option("--all", help="All 51 scenes.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the arrangement. Files have their own seed.")]
@@ -76,7 +85,7 @@ Background = Annotated[
     bool, typer.Option(help="Fill homes with background objects, as many as real rooms hold.")
 ]
 CORES = usable_cores()
-_user_errors = partial(user_errors, more=(FloorPlanError, ModelFileError, SceneFileError))
+_user_errors = partial(user_errors, more=(FloorPlanError, HouseFileError, ModelFileError, SceneFileError))
 LEFT_OUT = "for objects that were left out, and why: `embomatrix scene show NAME`, or --report FILE"
 
 
@@ -103,8 +112,7 @@ def build(
     chosen = _chosen(scene_ids, every)
     # Bad input is reported before anything is written or hours of work begin.
     with _user_errors():
-        for name in chosen:
-            Catalog.load().inventory(name)
+        houses = _houses(chosen)
         if assets is not None:
             read_assets(assets)
     check_output(report)
@@ -117,13 +125,18 @@ def build(
             seed,
             out / (f"{name}-{seed}.json" if several else f"{name}.json"),
             assets,
+            house=house,
             background=background,
         )
-        for name in chosen
+        for name, house in houses.items()
         for seed in dict.fromkeys(seeds or (0,))
     ]
     reports = _run(orders, jobs)
     say(orders[0].path if len(orders) == 1 else out)
+    for done in reports:
+        if done.scene_id in houses and houses[done.scene_id] is not None:
+            for sentence in done.left_out:
+                say(f"left out of {done.scene_id}: {sentence}")
     _print_reports(reports, report)
 
 
@@ -139,10 +152,14 @@ def check(
     orders = []
     with _user_errors():
         for name in _chosen(scenes, every):
-            if scene := _read(name):
+            if name.endswith(SUFFIX):
+                scene = read_scene(Path(name))
                 orders.append(SceneBuildJob(scene.scene_id, scene.seed, source=Path(name)))
-            else:
-                orders += [SceneBuildJob(name, seed) for seed in dict.fromkeys(seeds or (0,))]
+                continue
+            for scene_id, house in _houses([name]).items():
+                orders += [
+                    SceneBuildJob(scene_id, seed, house=house) for seed in dict.fromkeys(seeds or (0,))
+                ]
     check_output(report)
     _print_reports(_run(orders, jobs), report)
 
@@ -180,7 +197,7 @@ def draw(
     names = () if kind is Drawing.RELATIONS else _chosen(scenes, every)
     with _user_errors(out):
         for name in names:
-            _read(name)
+            _check_source(name)
         out.mkdir(parents=True, exist_ok=True)
         with progress() as bars:
             built = [_built(name, seed) for name in bars.track(names, description="scenes")]
@@ -240,13 +257,34 @@ def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))
 
 
-def _read(name: str) -> Scene | None:
-    """Return the scene of a file, or None for a scene of the catalog. Raise SceneFileError or CatalogError."""
+def _houses(names: Sequence[str]) -> dict[str, Path | None]:
+    """Return the scenes to build by name, each with its house file or None for one of the catalog.
+
+    Raise HouseFileError or CatalogError; a scene that is named twice is a HouseFileError.
+    """
+    found: dict[str, Path | None] = {}
+    for name in names:
+        path = Path(name) if name.endswith(HOUSE_SUFFIX) else None
+        scene_id = Catalog.load().inventory(name).scene_id if path is None else read_house(path).scene
+        if scene_id in found:
+            raise HouseFileError(
+                f"{path} and {found[scene_id]} both describe the scene {scene_id!r}: change `scene` in one of them"
+            )
+        found[scene_id] = path
+    return found
+
+
+def _check_source(name: str) -> None:
+    """Raise SceneFileError, HouseFileError or CatalogError unless a scene can be read or built."""
     if name.endswith(SUFFIX):
-        return read_scene(Path(name))
-    Catalog.load().inventory(name)
-    return None
+        read_scene(Path(name))
+    else:
+        _houses([name])
 
 
 def _built(name: str, seed: int) -> Scene:
-    return _read(name) or build_base_scene(name, seed=seed)
+    if name.endswith(SUFFIX):
+        return read_scene(Path(name))
+    if name.endswith(HOUSE_SUFFIX):
+        return build_house(read_house(Path(name)), seed=seed)
+    return build_base_scene(name, seed=seed)

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +12,10 @@ from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
 from embomatrix.factory.commands.terminal import check_output, counter, fail, say, show_table, user_errors
 from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
-from embomatrix.factory.pipeline.settings import scene_ids
+from embomatrix.factory.pipeline.settings import DEFAULT_SCENES
 from embomatrix.factory.pipeline.store import ResumableLog
+from embomatrix.factory.scenes.base_scenes import base_scenes, keep_scenes
+from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.factory.task_import.batch import Imported, Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.importer import Depth, ImportSettings, importing
@@ -38,6 +40,7 @@ from embomatrix.factory.task_import.sources import (
 )
 from embomatrix.world.bddl import BddlError, BddlProblem
 from embomatrix.world.dataset import TASKS_FILE, DatasetError, write_dataset
+from embomatrix.world.scene import Scene
 from embomatrix.world.substances import is_substance
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import write_whole
@@ -99,10 +102,10 @@ def import_(
         if out is not None:
             _check_free(out, depth, outcomes)
         sources = _selected(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
-        settings = ImportSettings(scene_ids(scenes), seed, depth, look_ahead)
+        settings = ImportSettings(base_scenes(scenes or DEFAULT_SCENES), seed, depth, look_ahead)
         log = _resumed_log(outcomes, sources, settings)
         made = _import_all(sources[len(log.outcomes) :], settings, processes(jobs), log)
-        admitted = out is None or _written(out, made)
+        admitted = out is None or _written(out, made, settings.scenes.own)
         all_outcomes = log.outcomes
         verified = depth is Depth.VERIFY
         evaluation = (
@@ -119,11 +122,13 @@ def import_(
         )
 
 
-def _written(out: Path, made: Sequence[Imported]) -> bool:
-    """Write the admitted tasks as a dataset. Return False if there are none."""
+def _written(out: Path, made: Sequence[Imported], own: Mapping[str, Scene]) -> bool:
+    """Write the admitted tasks as a dataset, with their scenes of files. Return False if there are none."""
     # a problem that is given twice makes one task
     verified = list({item.record.task.task_id: item for item in made if isinstance(item, Verified)}.values())
     if verified:
+        used = dict.fromkeys(base_scene_of(item.record.task.scene_id) for item in verified)
+        keep_scenes(out, [own[name] for name in used if name in own])
         bundles = {item.record.bundle_digest: item.bundle for item in verified}
         write_dataset(out, [item.record for item in verified], bundles)
     return bool(verified)
@@ -139,7 +144,7 @@ def _resumed_log(
     decisive_settings = {
         "seed": settings.seed,
         "depth": settings.depth,
-        "scenes": [*settings.scenes],
+        "scenes": [*map(settings.scenes.key, settings.scenes.names)],
         "look_ahead": settings.look_ahead,
     }
     log.resume(decisive_settings, outcome_from_json)

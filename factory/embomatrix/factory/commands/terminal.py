@@ -25,6 +25,7 @@ from embomatrix.factory.metrics.figures import (
     verdict_on,
     write_evaluation,
 )
+from embomatrix.factory.scenes.scene_file import SceneFileError
 from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.host import failure
 from embomatrix.host.printable import printable
@@ -44,6 +45,7 @@ USER_ERRORS: Final = (
     EngineError,
     EvaluationError,
     ProblemSourceError,
+    SceneFileError,
 )
 """Errors whose message is a sentence for the user."""
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Final
 
 from embomatrix.factory.admission import SEED, RefusalReason, TaskRefusal
@@ -54,15 +56,20 @@ SPATIAL: Final = frozenset(
 class DayMaker:
     """Maker of days in this process. A result depends only on the settings and the order. Close the maker after use.
 
-    ``plan`` replaces the rule-based planner of days.
+    ``plan`` replaces the rule-based planner of days. ``own`` are base scenes of files by name.
     """
 
-    def __init__(self, settings: BuildSettings, plan: PlanDay = plan_day) -> None:
+    def __init__(
+        self,
+        settings: BuildSettings,
+        plan: PlanDay = plan_day,
+        own: Mapping[str, Scene] = MappingProxyType({}),
+    ) -> None:
         self._settings = settings
         self._plan = plan
         self._library = PlacementLibrary()
         self._foresight = ReachabilitySurvey() if settings.look_ahead else None
-        self._bases: dict[str, Scene] = {}
+        self._bases: dict[str, Scene] = dict(own)
 
     def make(self, order: VariantOrder) -> VariantYield:
         """Plan a day and prove its tasks."""

@@ -19,11 +19,12 @@ from embomatrix.factory.floorplan.spec import (
     OpeningSpec,
     RoomSpec,
 )
-from embomatrix.factory.floorplan.walls import Rect, WallCut, shared_edge
+from embomatrix.factory.floorplan.walls import Edge, Rect, WallCut, shared_edge
 from embomatrix.world.scene import Doorway
 
-FRONT_YARD_M: Final = 3.0
-"""Preferred free ground before the front door, so that it does not open into a gap between two rooms."""
+YARDS_M: Final = (3.0, 0.5)
+"""Free ground before the front door, so that it does not open into a gap between two rooms; the preferred depth first."""
+USUAL_DOOR: Final = OpeningSpec("", 0.9, 2.05)
 
 
 def place_doorways(
@@ -32,7 +33,7 @@ def place_doorways(
     """Return doorways that join all rooms, the exterior one last, and a sentence on listed doors without a place."""
     left = {r.name: list(r.doors) for r in rooms}
     types = {r.name: r.type for r in rooms}
-    front = _front_door(rooms, rects)
+    front = front_door(rooms, rects)
     if front.opening.model:
         room = front.opening.rooms[0]
         left[room].remove(next(d for d in left[room] if d.model == front.opening.model))
@@ -66,14 +67,24 @@ def _join(
     edge = shared_edge(rects[a], rects[b])
     if edge is None:
         raise FloorPlanError(f"rooms {a!r} and {b!r} share no wall: expected neighbours")
-    door = _take_door(left[a], left[b])
+    return inner_doorway((a, b), edge, _take_door(left[a], left[b]), (types[a], types[b]), rng)
+
+
+def inner_doorway(
+    rooms: tuple[str, str],
+    edge: Edge,
+    door: OpeningSpec | None,
+    types: tuple[str, str],
+    rng: np.random.Generator,
+) -> WallCut[Doorway]:
+    """Return a doorway in the wall ``edge`` between two rooms of these types; without a door it has the usual size."""
     if door is not None:
         width, height = door.width_m, door.height_m
-    elif types[a] in OPEN_PLAN and types[b] in OPEN_PLAN:
+    elif types[0] in OPEN_PLAN and types[1] in OPEN_PLAN:
         # Short walls keep the depth of a counter on either side of the passage.
         width, height = min(OPEN_PASSAGE_M, max(MIN_DOOR_M, edge.length - 1.4)), MAX_DOOR_HEIGHT_M
     else:
-        width, height = 0.9, 2.05
+        width, height = USUAL_DOOR.width_m, USUAL_DOOR.height_m
     width = min(max(width, MIN_DOOR_M), edge.length)
     slack = edge.length - width
     # Doors are near a corner, which leaves long walls; wide passages may also be in the middle.
@@ -81,7 +92,7 @@ def _join(
         (slack / 2,) if slack < 0.5 else (0.2, slack - 0.2) if width <= 1.2 else (0.1, slack / 2, slack - 0.1)
     )
     start = edge.start + float(rng.choice(ends))
-    return edge.doorway((a, b), start, width, min(height, MAX_DOOR_HEIGHT_M), door.model if door else "")
+    return edge.doorway(rooms, start, width, min(height, MAX_DOOR_HEIGHT_M), door.model if door else "")
 
 
 def _take_door(a: list[OpeningSpec], b: list[OpeningSpec]) -> OpeningSpec | None:
@@ -94,7 +105,7 @@ def _take_door(a: list[OpeningSpec], b: list[OpeningSpec]) -> OpeningSpec | None
     return a.pop(0) if a else b.pop(0) if b else None
 
 
-def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> WallCut[Doorway]:
+def front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> WallCut[Doorway]:
     """Return the exterior door, in the most public room with enough outer wall.
 
     A door listed by a single room is an exterior one: a public room with such a door comes first. A house without public
@@ -110,15 +121,22 @@ def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> WallCut
         rank = public.index(room.type) if room.type in public else len(public) + (room.type in PRIVATE)
         return (not own_doors(room), rank)
 
-    for yard_m in (FRONT_YARD_M, 0.5):
+    for yard_m in YARDS_M:
         for room in sorted(rooms, key=order):
-            door = max(own_doors(room), key=lambda d: d.width_m, default=OpeningSpec("", 0.9, 2.05))
-            others = [r for n, r in rects.items() if n != room.name]
-            outer = rects[room.name].outer_edges(others, yard_m)
-            edge = max(outer, key=lambda e: e.length, default=None)
-            if edge is not None and edge.length >= MIN_DOOR_M + 0.1:
-                width = min(max(door.width_m, MIN_DOOR_M), edge.length - 0.1)
-                start = edge.start + (edge.length - width) / 2
-                height = min(door.height_m, MAX_DOOR_HEIGHT_M)
-                return edge.doorway((room.name, ""), start, width, height, door.model)
+            door = max(own_doors(room), key=lambda d: d.width_m, default=USUAL_DOOR)
+            if (cut := outer_doorway(room.name, door, rects, yard_m)) is not None:
+                return cut
     raise FloorPlanError("no room has an outer wall wide enough for a front door")
+
+
+def outer_doorway(
+    room: str, door: OpeningSpec, rects: Mapping[str, Rect], yard_m: float
+) -> WallCut[Doorway] | None:
+    """Return a door to the outside in the longest outer wall of a room with ``yard_m`` of free ground before it, if any."""
+    others = [rect for name, rect in rects.items() if name != room]
+    edge = max(rects[room].outer_edges(others, yard_m), key=lambda e: e.length, default=None)
+    if edge is None or edge.length < MIN_DOOR_M + 0.1:
+        return None
+    width = min(max(door.width_m, MIN_DOOR_M), edge.length - 0.1)
+    start = edge.start + (edge.length - width) / 2
+    return edge.doorway((room, ""), start, width, min(door.height_m, MAX_DOOR_HEIGHT_M), door.model)

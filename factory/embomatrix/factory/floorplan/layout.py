@@ -4,7 +4,7 @@ Every room is packed as its floor grown by half a wall on each side, so neighbou
 best of many seeded trials of slot packing wins.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +13,7 @@ import numpy as np
 from embomatrix.factory.floorplan.doors import place_doorways
 from embomatrix.factory.floorplan.packing import Packing, pack
 from embomatrix.factory.floorplan.spec import MIN_DOOR_M, FloorPlanError, RoomSpec
-from embomatrix.factory.floorplan.walls import WALL_M, build_walls
+from embomatrix.factory.floorplan.walls import WALL_M, Rect, WallCut, build_walls
 from embomatrix.factory.floorplan.windows import place_windows
 from embomatrix.world.geometry import ConvexPart
 from embomatrix.world.scene import Doorway, Room, Window
@@ -67,16 +67,31 @@ def plan_floor(rooms: Sequence[RoomSpec], rng: np.random.Generator, *, trials: i
 
 def _finish(rooms: Sequence[RoomSpec], packing: Packing, rng: np.random.Generator) -> tuple[float, FloorPlan]:
     """Add doorways, windows and walls to a packing; return its score, windows without a wall included, and the plan."""
-    low = np.min([*packing.rects.values()], axis=0)
-    rects = {name: rect.moved(-float(low[0]), -float(low[1])) for name, rect in packing.rects.items()}
+    rects = at_origin(packing.rects)
     doors, unused = place_doorways(rooms, rects, packing.parents, rng)
+    plan = with_walls(rooms, rects, doors, unused)
+    listed = sum(len(room.windows) for room in rooms)
+    return packing.score + WINDOW_COST_M2 * (listed - len(plan.windows)), plan
+
+
+def at_origin(rects: Mapping[str, Rect]) -> dict[str, Rect]:
+    """Move the rooms together so that their bounding box begins at (0, 0)."""
+    low = np.min([*rects.values()], axis=0)
+    return {name: rect.moved(-float(low[0]), -float(low[1])) for name, rect in rects.items()}
+
+
+def with_walls(
+    rooms: Sequence[RoomSpec],
+    rects: Mapping[str, Rect],
+    doors: Sequence[WallCut[Doorway]],
+    unused: Sequence[str] = (),
+) -> FloorPlan:
+    """Add windows and walls to placed rooms. ``unused`` are sentences on doors without a place."""
     panes, walled_up = place_windows(rooms, rects, doors)
-    plan = FloorPlan(
+    return FloorPlan(
         rooms=tuple(Room(s.name, s.type, *rects[s.name].floor, s.height_m) for s in rooms),
         walls=build_walls(rects, doors, panes, {s.name: s.height_m for s in rooms}),
         doorways=tuple(cut.opening for cut in doors),
         windows=tuple(cut.opening for cut in panes),
         left_out=(*unused, *walled_up),
     )
-    listed = sum(len(room.windows) for room in rooms)
-    return packing.score + WINDOW_COST_M2 * (listed - len(panes)), plan

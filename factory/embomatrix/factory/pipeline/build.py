@@ -10,19 +10,21 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Protocol
 
 from embomatrix.factory.layout.request import LayoutAgents
 from embomatrix.factory.pipeline.settings import BuildSettings
-from embomatrix.factory.pipeline.store import BuildStore, Rejection, VariantYield
+from embomatrix.factory.pipeline.store import BUILD_FILE, BuildStore, Rejection, VariantYield
 from embomatrix.factory.pipeline.variants import TASKS_PER_VARIANT, VariantMaker, VariantOrder, uniqueness_key
-from embomatrix.factory.scenes.build import base_scene_of, build_base_scene
+from embomatrix.factory.scenes.base_scenes import BaseScenes, check_kept, keep_scenes
+from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.household import place_of
 from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.sim.process_pool import shared_work
-from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError, TaskRecord, write_dataset
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
@@ -112,10 +114,9 @@ class _HeldOutRooms:
         self._left[base] -= self._worth[base][room]
 
 
-def _check_rooms(settings: BuildSettings) -> None:
+def _check_rooms(settings: BuildSettings, scenes: BaseScenes) -> None:
     """Raise CatalogError for an unknown scene, or DatasetError if tasks are held out but no room can be."""
-    catalog = Catalog.load()
-    types = Counter(room.type for scene_id in settings.scenes for room in catalog.inventory(scene_id).rooms)
+    types = Counter(scenes.room_types())
     if settings.train and settings.heldout and max(types.values(), default=0) < 2:
         raise DatasetError(
             f"no room of {', '.join(settings.scenes)} can be held out, each is the only one of its type: add another "
@@ -135,7 +136,8 @@ class Maker(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Making:
-    """Way in which variants are made. ``begin`` starts a maker from the settings, in each process of the build.
+    """Way in which variants are made. ``begin`` starts a maker from the settings, in each process of the build. Scenes of
+    files are its argument ``own``.
 
     If ``whole_scenes``, the held-out tasks lie in scenes of their own, otherwise in rooms of their own. ``tasks`` is the
     number of tasks that a variant should yield. ``most`` is the largest share of a category; None makes
@@ -204,10 +206,12 @@ def build_dataset(
     check: VariantCheck | None = None,
     layout: LayoutAgents | None = None,
     making: Making | None = None,
+    own: Mapping[str, Scene] = MappingProxyType({}),
 ) -> BuildSummary:
     """Build a dataset, or resume an interrupted build. ``progress`` is called with each split's number of admitted tasks.
 
-    ``making`` replaces the maker of variants.
+    ``making`` replaces the maker of variants. ``own`` are scenes of files by their names in the settings; the folder keeps
+    them.
 
     ``check`` is a second check of each variant, such as a cluster. ``writer`` and ``layout`` replace the writer of
     the settings and the rule-based layout agents; they run in this process. Otherwise ``jobs`` processes are used.
@@ -216,11 +220,14 @@ def build_dataset(
     build with other settings, or if a process dies. Raise OSError if the folder can't be written.
     """
     whole_scenes = making is not None and making.whole_scenes
+    scenes = BaseScenes(settings.scenes, own)
     if not whole_scenes:
-        _check_rooms(settings)  # checked before anything is written, so that an error leaves no folder behind
-    store = BuildStore(folder, dataclasses.asdict(settings))
+        _check_rooms(
+            settings, scenes
+        )  # checked before anything is written, so that an error leaves no folder behind
+    store = _store_in(folder, settings, list(own.values()))
     began = time.process_time()
-    bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
+    bases = scenes.built_all(seed=settings.seed)
     store.spend({"base_scenes": len(bases)}, time.process_time() - began)
     rooms = _rooms_by_split(bases, settings, whole_scenes=whole_scenes)
     died = DatasetError(
@@ -233,7 +240,8 @@ def build_dataset(
         begin_with: tuple[object, ...] = (settings, writer, layout)
     else:
         begin_with = (settings,)
-    with shared_work(1 if here else jobs, making.begin, _make, *begin_with, died=died) as make:
+    begin = partial(making.begin, own=dict(own)) if own else making.begin
+    with shared_work(1 if here else jobs, begin, _make, *begin_with, died=died) as make:
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
             orders = _SplitOrders(store, bases, rooms[split], split, target, making)
             while round_orders := orders.next_round():
@@ -245,6 +253,15 @@ def build_dataset(
     records = [record for result in store.results for record in result.records]
     write_dataset(folder, records, {})
     return _summary(store, rooms)
+
+
+def _store_in(folder: Path, settings: BuildSettings, own: Sequence[Scene]) -> BuildStore:
+    """Start or resume a build. The scenes of files are written before it starts, and compared when it is resumed."""
+    if not (folder / BUILD_FILE).exists():
+        keep_scenes(folder, own)
+    store = BuildStore(folder, dataclasses.asdict(settings))
+    check_kept(folder, own)
+    return store
 
 
 class _SplitOrders:

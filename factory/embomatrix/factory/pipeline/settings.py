@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from embomatrix.world.catalog import Catalog
-
 DEFAULT_SCENES: Final = ("Rs_int", "Wainscott_0_int", "restaurant_diner")
 
 
@@ -38,14 +36,3 @@ class BuildSettings:
 
 SCENE_EXTRACTOR: Final = "scene-extractor"
 """Name of scene information extraction in `modelled`, for builds with a vision model."""
-EVERY_SCENE: Final = "all"
-
-
-def scene_ids(requested: list[str] | None) -> tuple[str, ...]:
-    """Return the requested scenes without repetition.
-
-    "all" stands for every base scene. No request means the three defaults.
-    """
-    if requested and EVERY_SCENE in requested:
-        return Catalog.load().scene_ids
-    return tuple(dict.fromkeys(requested or DEFAULT_SCENES))

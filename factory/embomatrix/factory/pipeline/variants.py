@@ -7,6 +7,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -79,8 +80,8 @@ class VariantOrder:
 class VariantMaker:
     """Maker of variants in this process. Placement results are reused between variants.
 
-    ``writer`` replaces the writer of the settings, ``layout`` the rule-based layout agents. Each result depends only
-    on the settings and the order. Close the maker after use.
+    ``writer`` replaces the writer of the settings, ``layout`` the rule-based layout agents. ``own`` are base scenes of files
+    by name. Each result depends only on these, the settings and the order. Close the maker after use.
     """
 
     def __init__(
@@ -88,6 +89,7 @@ class VariantMaker:
         settings: BuildSettings,
         writer: TaskWriter | None = None,
         layout: LayoutAgents | None = None,
+        own: Mapping[str, Scene] = MappingProxyType({}),
     ) -> None:
         if writer is None:
             writer = PlainWriter()
@@ -96,7 +98,7 @@ class VariantMaker:
         self.library = PlacementLibrary()
         self.foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._layout = layout
-        self._bases: dict[str, Scene] = {}
+        self._bases: dict[str, Scene] = dict(own)
 
     def make(self, order: VariantOrder) -> VariantYield:
         """Write and judge the tasks of one variant."""

@@ -16,7 +16,8 @@ from embomatrix.world.catalog import Catalog
 class SceneBuildJob:
     """Scene to build and check. ``path`` is the output file, ``assets`` a folder of imported assets.
 
-    A job with a ``source``, the file of an earlier build, only checks that file.
+    A job with a ``source``, the file of an earlier build, only checks that file. A job with a ``house``, a house file, builds
+    that floor plan.
     """
 
     scene_id: str
@@ -24,6 +25,7 @@ class SceneBuildJob:
     path: Path | None = None
     assets: Path | None = None
     source: Path | None = None
+    house: Path | None = None
     background: bool = True
     """Fill homes with background objects."""
 
@@ -54,7 +56,7 @@ def _run(job: SceneBuildJob) -> SceneReport:
     if job.source is not None:
         return report_on_file(job.scene_id, job.seed, job.source)
     imported = read_assets(job.assets) if job.assets is not None else {}
-    report, scene = report_on(job.scene_id, job.seed, imported, background=job.background)
+    report, scene = report_on(job.scene_id, job.seed, imported, background=job.background, house=job.house)
     if scene is not None and job.path is not None:
         try:
             write_scene(job.path, scene)
@@ -66,6 +68,6 @@ def _run(job: SceneBuildJob) -> SceneReport:
 
 def _object_count(catalog: Catalog, job: SceneBuildJob) -> int:
     """Return the number of objects to place, which predicts the time that the job takes."""
-    if job.source is not None:
+    if job.source is not None or job.house is not None:
         return 0
     return sum(count for room in catalog.inventory(job.scene_id).rooms for _, _, count in room.items)

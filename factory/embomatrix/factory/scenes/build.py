@@ -1,9 +1,9 @@
-"""Base scenes: rooms, walls, doorways and furniture made from an inventory."""
+"""Base scenes: rooms, walls, doorways and furniture made from an inventory or a house file."""
 
 import logging
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
@@ -12,6 +12,8 @@ import numpy as np
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.clutter.background import with_background
 from embomatrix.factory.floorplan.ceilings import ceiling_height_m
+from embomatrix.factory.floorplan.house_file import House, HouseRoom
+from embomatrix.factory.floorplan.houses import plan_house
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
 from embomatrix.factory.floorplan.spec import OpeningSpec, RoomSpec
 from embomatrix.factory.furnish.pieces import FurniturePiece, Placed
@@ -19,8 +21,9 @@ from embomatrix.factory.furnish.roles import FurnitureRole, is_portable, role_of
 from embomatrix.factory.furnish.rooms import Furnishing, furnish
 from embomatrix.factory.furnish.space import RoomSpace
 from embomatrix.factory.scenes.access import with_all_served
+from embomatrix.factory.scenes.wishes import inventory_of
 from embomatrix.world.asset import Asset
-from embomatrix.world.catalog import Catalog, RoomInventory, SceneInventory
+from embomatrix.world.catalog import Catalog, RoomInventory
 from embomatrix.world.scene import RobotStart, Scene, SceneObject
 
 logger = logging.getLogger(__name__)
@@ -32,6 +35,8 @@ LOSS_TAKEN: Final = 4.0
 """Loss of importance up to which a plan is accepted: a trash can may be left out, a cabinet or a bed may not."""
 ESSENTIAL: Final = 15.0
 """Loss of importance up to which a plan is accepted after PLANS attempts: essential pieces get more attempts."""
+USUAL_WINDOW: Final = OpeningSpec("", 1.2, 1.2)
+"""Window of a house file's room."""
 _FLAT_NAMES: Final = (
     "picture painting portrait information_bulletin periodic_table map projection_screen hanging_banners hanging "
     "architectural_plan"
@@ -55,9 +60,53 @@ def build_base_scene(
     catalog = Catalog.load()
     inventory = catalog.inventory(scene_id)
     rng = np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(scene_id.encode()))))
-    pieces, notes = _pieces(catalog, inventory, imported)
+    pieces, notes = _pieces(catalog, inventory.rooms, imported)
     specs = [room_spec(catalog, room) for room in inventory.rooms]
-    plan, result = _best_plan(specs, pieces, rng)
+    plan, result = _best_plan(lambda: plan_floor(specs, rng), pieces, rng)
+    return _scene(scene_id, seed, plan, result, notes, background=background)
+
+
+def build_house(
+    house: House,
+    *,
+    seed: int = 0,
+    imported: Mapping[str, Asset] = MappingProxyType({}),
+    background: bool = True,
+) -> Scene:
+    """Lay out and furnish the floor plan of a house file. Equal arguments give equal scenes.
+
+    ``imported`` and ``background`` are those of `build_base_scene`. Raises FloorPlanError if the doors leave no arrangement
+    of the rooms.
+    """
+    catalog = Catalog.load()
+    rng = np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(house.scene.encode()))))
+    rooms = [inventory_of(catalog, room, rng) for room in house.rooms]
+    specs = [
+        _house_spec(catalog, room, inventory) for room, inventory in zip(house.rooms, rooms, strict=True)
+    ]
+    pieces, notes = _pieces(catalog, rooms, imported)
+    plan, result = _best_plan(lambda: plan_house(house, specs, rng), pieces, rng)
+    return _scene(house.scene, seed, plan, result, notes, background=background)
+
+
+def _house_spec(catalog: Catalog, room: HouseRoom, inventory: RoomInventory) -> RoomSpec:
+    """Return the spec of a house's room, with windows of the usual size and without doors."""
+    height_m = room.height_m or ceiling_height_m(room.type, room.floor_m, _hanging(catalog, inventory))
+    return RoomSpec(
+        room.name, room.type, room.floor_m, windows=(USUAL_WINDOW,) * room.windows, height_m=height_m
+    )
+
+
+def _scene(
+    scene_id: str,
+    seed: int,
+    plan: FloorPlan,
+    result: Furnishing,
+    notes: Sequence[str],
+    *,
+    background: bool,
+) -> Scene:
+    """Return the scene of a furnished floor plan. ``notes`` are sentences on what was left out before."""
     objects, assets = _objects(result.placed)
     scene = Scene(
         scene_id=scene_id,
@@ -91,13 +140,13 @@ def base_scene_of(scene_id: str) -> str:
 
 
 def _best_plan(
-    specs: Sequence[RoomSpec], pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator
+    make_plan: Callable[[], FloorPlan], pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator
 ) -> tuple[FloorPlan, Furnishing]:
-    """Furnish plans until one loses nothing important; houses with many pieces get a single plan."""
+    """Make and furnish plans until one loses nothing important; houses with many pieces get a single plan."""
     tried: list[tuple[FloorPlan, Furnishing]] = []
     small_house = sum(len(mine) for mine in pieces.values()) < SMALL_HOUSE
     for attempt in range(PLANS_FOR_ESSENTIALS if small_house else 1):
-        plan = plan_floor(specs, rng)
+        plan = make_plan()
         tried.append((plan, furnish(plan, pieces, rng)))
         least_loss = min(result.loss for _, result in tried)
         if least_loss < (LOSS_TAKEN if attempt < PLANS - 1 else ESSENTIAL):
@@ -130,15 +179,15 @@ def _hanging(catalog: Catalog, room: RoomInventory) -> Iterator[float]:
 
 
 def _pieces(
-    catalog: Catalog, inventory: SceneInventory, imported: Mapping[str, Asset]
+    catalog: Catalog, rooms: Sequence[RoomInventory], imported: Mapping[str, Asset]
 ) -> tuple[dict[str, list[FurniturePiece]], list[str]]:
     """Return the items of every room as pieces, and sentences on items listed twice and on floors not modelled."""
-    notes = [note for room in inventory.rooms for note in _floor_notes(room)]
+    notes = [note for room in rooms for note in _floor_notes(room)]
     pieces: dict[str, list[FurniturePiece]] = {}
     seen: set[str] = set()
     number = 0
     # Large rooms first: a piece that spans two rooms, like a bar, is listed in both and stands in the larger one.
-    for room in sorted(inventory.rooms, key=lambda r: -r.floor_m[0] * r.floor_m[1]):
+    for room in sorted(rooms, key=lambda r: -r.floor_m[0] * r.floor_m[1]):
         mine = pieces.setdefault(room.name, [])
         for category, model, count in room.items:
             asset = imported.get(f"{category}-{model}") or build_asset(catalog, category, model)

@@ -11,9 +11,10 @@ from typing import Any, Final
 
 from rich.table import Table
 
+from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
 from embomatrix.factory.floorplan.layout import compactness
 from embomatrix.factory.floorplan.spec import FloorPlanError
-from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.build import build_base_scene, build_house
 from embomatrix.factory.scenes.check import (
     ProblemKind,
     SceneProblem,
@@ -78,12 +79,19 @@ def report_on(
     imported: Mapping[str, Asset] = MappingProxyType({}),
     *,
     background: bool = True,
+    house: Path | None = None,
 ) -> tuple[SceneReport, Scene | None]:
-    """Build one scene, perhaps with imported assets, and check it; the report contains failures."""
+    """Build one scene, perhaps with imported assets, and check it; the report contains failures.
+
+    ``house`` is the file of a floor plan; without one, the scene is that of the catalog.
+    """
     started = time.process_time()
     try:
-        scene = build_base_scene(scene_id, seed=seed, imported=imported, background=background)
-    except (CatalogError, FloorPlanError) as error:
+        if house is None:
+            scene = build_base_scene(scene_id, seed=seed, imported=imported, background=background)
+        else:
+            scene = build_house(read_house(house), seed=seed, imported=imported, background=background)
+    except (CatalogError, FloorPlanError, HouseFileError) as error:
         return SceneReport(scene_id, seed, error=str(error)), None
     built = time.process_time()
     try:
@@ -117,7 +125,7 @@ def report_of(scene: Scene, *, build_s: float = 0.0) -> SceneReport:
         rooms=len(scene.rooms),
         doorways=len(scene.doorways),
         windows=len(scene.windows),
-        listed=sum(_listed(scene.base).values()),
+        listed=_count_listed(scene),
         placed=len(scene.objects),
         movable=settlement.movable,
         build_s=build_s,
@@ -137,11 +145,7 @@ def unaccounted(scene: Scene) -> tuple[SceneProblem, ...]:
     A scene without an inventory in the catalog has nothing unaccounted for.
     """
     placed = Counter(item.asset_id for item in scene.objects)
-    reported: Counter[str] = Counter()
-    for sentence in scene.left_out:
-        match = _COUNT.match(sentence)
-        if match is not None:
-            reported[match[2]] += int(match[1])
+    reported = _reported(scene)
     return tuple(
         SceneProblem(
             ProblemKind.UNACCOUNTED,
@@ -151,6 +155,24 @@ def unaccounted(scene: Scene) -> tuple[SceneProblem, ...]:
         for asset_id, count in _listed(scene.base).items()
         if placed[asset_id] + reported[asset_id] < count
     )
+
+
+def _reported(scene: Scene) -> Counter[str]:
+    """Return the number of each model that is reported as left out; doors, windows and floors stand under their words."""
+    reported: Counter[str] = Counter()
+    for sentence in scene.left_out:
+        match = _COUNT.match(sentence)
+        if match is not None:
+            reported[match[2]] += int(match[1])
+    return reported
+
+
+def _count_listed(scene: Scene) -> int:
+    """Return the number of items in the scene's inventory; of a house file, those that were placed or left out."""
+    if scene.base in Catalog.load().scene_ids:
+        return sum(_listed(scene.base).values())
+    left_out = sum(n for word, n in _reported(scene).items() if not word.startswith(("window-", "door-")))
+    return len(scene.objects) + left_out
 
 
 def _listed(scene_id: str) -> Mapping[str, int]:

@@ -18,9 +18,10 @@ from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.world.asset import Asset
 from embomatrix.world.bddl import BddlProblem, InitLiteral, is_room_instance, parse_problem
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.evaluate import map_atoms, subformulas
+from embomatrix.world.evaluate import atoms_of, map_atoms, subformulas
 from embomatrix.world.goal import And, Atom, Formula, Quantified
 from embomatrix.world.state import Relation
+from embomatrix.world.substances import is_substance
 
 RENAMED: Final[Mapping[str, tuple[str, ...]]] = {
     "cupboard.n.01": ("cabinet.n.01",),
@@ -152,7 +153,7 @@ def read_problem(source: SourceText) -> tuple[BddlProblem, tuple[str, ...]]:
     """
     words = GROUPS if source.source == EAI else RENAMED
     text, replaced = translate_types(source.text, {**words, **_lamps_for(source.text)})
-    problem, read = with_possible_relations(parse_problem(text))
+    problem, read = with_possible_relations(with_named_substances(parse_problem(text)))
     problem, left = without_places_left(problem)
     problem, added = with_implied_rooms(problem)
     return problem, (*replaced, *read, *left, *added)
@@ -227,6 +228,15 @@ def _assets_of(type_name: str) -> Iterator[Asset]:
     for category in catalog.categories_of(type_name) if catalog.has_synset(type_name) else ():
         for model in catalog.models_of(category):
             yield build_asset(catalog, model.category, model.model_id)
+
+
+def with_named_substances(problem: BddlProblem) -> BddlProblem:
+    """Declare the substances that start or goal name by their synset, such as ``dust.n.01``."""
+    atoms = (*atoms_of(problem.goal), *(item.atom for item in problem.init))
+    named = {arg for atom in atoms for arg in atom.args if arg not in problem.objects and is_substance(arg)}
+    if not named:
+        return problem
+    return dataclasses.replace(problem, objects={**problem.objects, **{arg: arg for arg in sorted(named)}})
 
 
 def without_places_left(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationError
-from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.base_scenes import BaseScenes
 from embomatrix.factory.task_import.batch import Imported, bind_first, verify_first
 from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of, unparsable_outcome
 from embomatrix.factory.task_import.sources import SourceText
@@ -35,7 +35,7 @@ class Depth(StrEnum):
 class ImportSettings:
     """Settings that decide the imports of one command."""
 
-    scenes: tuple[str, ...]
+    scenes: BaseScenes
     seed: int
     depth: Depth
     look_ahead: bool
@@ -46,7 +46,7 @@ class ProblemImporter:
 
     def __init__(self, settings: ImportSettings) -> None:
         self._settings = settings
-        self._bases = [build_base_scene(scene_id) for scene_id in settings.scenes]
+        self._bases = settings.scenes.built_all()
         self._foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._library = PlacementLibrary()
 
@@ -57,7 +57,8 @@ class ProblemImporter:
         except BddlError as error:
             refusal = TaskRefusal(RefusalReason.UNPARSABLE, str(error))
             return unparsable_outcome(source, refusal.sentence), refusal
-        return outcome_of(source, item, self._settings.scenes), item
+        scenes = self._settings.scenes
+        return outcome_of(source, item, scenes.names, scenes.own), item
 
     def _imported(self, source: SourceText) -> Imported:
         seed = self._settings.seed

@@ -4,6 +4,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Final
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
@@ -15,6 +16,7 @@ from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.scene_changes import SceneChange, find_right_scene
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI, SourceText
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import Profile
 
 FIGURES: Final[Mapping[str, tuple[str, float]]] = {
@@ -71,11 +73,16 @@ def outcome_from_json(value: dict[str, Any]) -> ProblemOutcome:
     )
 
 
-def outcome_of(source: SourceText, imported: Imported, scenes: Sequence[str]) -> ProblemOutcome:
-    """Return the outcome of a problem that was imported into one of the scenes. Raise BddlError."""
+def outcome_of(
+    source: SourceText,
+    imported: Imported,
+    scenes: Sequence[str],
+    own: Mapping[str, Scene] = MappingProxyType({}),
+) -> ProblemOutcome:
+    """Return the outcome of a problem that was imported into one of the scenes; ``own`` are those of files. Raise BddlError."""
     problem, notes = read_problem(source)
     unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
-    has_right_scene = find_right_scene(source, problem, scenes) is not None
+    has_right_scene = find_right_scene(source, problem, scenes, own) is not None
     if isinstance(imported, TaskRefusal):
         return ProblemOutcome(
             source.name,

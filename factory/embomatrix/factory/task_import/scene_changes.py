@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Final
 
 from embomatrix.factory.scenes.view import SceneView, is_liftable
@@ -135,13 +136,21 @@ def _missing(wanted: Mapping[tuple[str, str], int], rooms: Mapping[str, RoomStoc
     return missing
 
 
-def find_right_scene(source: SourceText, problem: BddlProblem, scenes: Sequence[str]) -> str | None:
+def find_right_scene(
+    source: SourceText,
+    problem: BddlProblem,
+    scenes: Sequence[str],
+    own: Mapping[str, Scene] = MappingProxyType({}),
+) -> str | None:
     """Return the first scene with all rooms and all furniture of the problem, according to the catalog.
 
-    If the problem's author names scenes, no others count.
+    The scenes ``own``, by name, come from files and hold what stands in them. If the problem's author names scenes, no others
+    count.
     """
     catalog = Catalog.load()
+
+    def stock(name: str) -> tuple[RoomStock, ...]:
+        return stock_of(own[name]) if name in own else listed_stock(catalog.inventory(name))
+
     right = [scene for scene in scenes if not source.named_scenes or scene in source.named_scenes]
-    return next(
-        (scene for scene in right if lacking(problem, listed_stock(catalog.inventory(scene))) == 0), None
-    )
+    return next((scene for scene in right if lacking(problem, stock(scene)) == 0), None)

@@ -50,7 +50,7 @@ class SourceText:
     """Text of one problem. ``request`` is the instruction; if it is empty, the problem's name is the instruction.
 
     ``scene`` is the base scene that the problem was written for; empty means any scene. ``scenes`` lists those that
-    its author finds suitable.
+    its author finds suitable. ``instruction`` is used as it is, unlike ``request``, in which room names are replaced.
     """
 
     name: str
@@ -59,6 +59,7 @@ class SourceText:
     request: str = ""
     scene: str = ""
     scenes: tuple[str, ...] = ()
+    instruction: str = ""
 
     @property
     def named_scenes(self) -> tuple[str, ...]:

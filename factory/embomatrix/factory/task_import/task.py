@@ -124,7 +124,7 @@ class _Binder:
         self._base = base
         self._rng = rng
         self._options = options
-        self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
+        self._scene_id = f"{base.base}-{slug_of(source.name)}-{key}"
         self._requirements = requirements_of(problem)
 
     def imported(self) -> ImportedTask:
@@ -401,5 +401,6 @@ def _misfit(wrong: LayoutFailure) -> RefusedError:
     )
 
 
-def _slug(name: str) -> str:
+def slug_of(name: str) -> str:
+    """Return a problem's name as it stands in the ids of its tasks."""
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:40]

@@ -30,6 +30,8 @@ def instruction_of(
 
     ``rooms`` maps the problem's room names to the scene's, in the instruction too.
     """
+    if source.instruction:
+        return source.instruction
     words = source.request or problem.name
     words = re.sub(r"-\d+$", "", words)
     words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
