@@ -5,7 +5,7 @@ from enum import StrEnum
 from typing import Final
 
 from embomatrix.factory.admission import RefusalReason, TaskRefusal
-from embomatrix.factory.task_import.batch import Verified, has_shared_host, imports, verify
+from embomatrix.factory.task_import.batch import Verified, has_host, imports, verify
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions
 from embomatrix.factory.task_import.task_file import TaskFile
 from embomatrix.sim.physical.survey import ReachabilitySurvey
@@ -78,10 +78,10 @@ def try_task(
 
     Unlike `verify_first`, which looks for a scene, this ends with the first goal that holds at the start.
     """
-    options = ImportOptions(categories=file.categories)
+    options = ImportOptions(categories=file.categories, usable=True)
     order = list(RefusalReason)
     furthest: TaskTrial | None = None
-    for compact in (False, True) if has_shared_host(file.source) else (False,):
+    for compact in (False, True) if has_host(file.source) else (False,):
         verified = 0
         for found in imports(file.source, [base], seed=seed, options=replace(options, compact=compact)):
             if isinstance(found, TaskRefusal):
