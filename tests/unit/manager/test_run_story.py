@@ -32,8 +32,9 @@ def training(steps=20):
     view = TrainingView("r1", "evening", "grpo", steps, DAY_S, steps)
     figures = {"reward": [float(step) for step in range(steps)], "success": [None] * steps}
     phases = [
+        Curves("imitation", [10, 20, 30], {"loss": [2.0, 1.0, 0.5]}),
         Curves("success before GRPO", [0], {"all": [0.21]}),
-        Curves("grpo", list(range(steps)), figures),
+        Curves("grpo", list(range(1, steps + 1)), figures),
         Curves("success after GRPO", [0], {"all": [0.55]}),
     ]
     return TrainingDetail(view, phases)
@@ -71,13 +72,13 @@ def test_story_of_an_open_run_without_work_says_what_it_waits_for():
 
 def test_story_of_training_compares_first_and_last_steps_and_held_out_tasks():
     assert run_story(summary(), training())[-3:] == [
-        "Its trainer reported 20 steps of GRPO.",
+        "Its trainer reported 30 steps of imitation, 20 steps of GRPO.",
         "The mean reward was 4.50 in the first 10 steps and 14.50 in the last.",
         "Success on held-out tasks was 21% before GRPO and 55% after it.",
     ]
-    assert run_story(summary(), training(1))[-2] == "Its trainer reported 1 step of GRPO.", (
-        "it has no two ends"
-    )
+    assert run_story(summary(), training(1))[-2] == (
+        "Its trainer reported 30 steps of imitation, 1 step of GRPO."
+    ), "it has no two ends"
 
 
 def test_scene_of_a_single_demand_is_told_in_the_singular():

@@ -104,9 +104,9 @@ def _learning(training: TrainingDetail | None) -> Iterator[str]:
         return
     phases = {curves.phase: curves for curves in training.phases}
     steps = ", ".join(
-        f"{_counted(len(curves.steps), 'step')} of {name.replace('grpo', 'GRPO')}"
+        f"{_counted(max(curves.steps), 'step')} of {name.replace('grpo', 'GRPO')}"
         for name, curves in phases.items()
-        if not name.startswith("success ")
+        if not name.startswith("success ") and curves.steps
     )
     if steps:
         yield f"Its trainer reported {steps}."

@@ -1,4 +1,4 @@
-// One worker: its state, its machine's CPU and memory in the last half hour, its scenes, and its last log lines.
+// One worker: its state, its machine's CPU and memory in the last half hour, its last log lines, and its scenes.
 import {Refused, ask, change} from "./ask.js";
 import {chart} from "./charts.js";
 import {at, count, h, none, put, seconds, share, table} from "./dom.js";
@@ -9,18 +9,30 @@ const LOOK_EVERY = 2, GONE = ["lost", "left"];
 /** Ticks at whole minutes of the day. */
 const MINUTES = [60, 120, 300, 600, 1800];
 const timeOfDay = at_s => `${new Date(at_s * 1000).toISOString().slice(11, 16)} UTC`;
-let name = "", looks = 0, drawn = {};
+/** Scenes that are listed at first. */
+const SCENES = 12;
+let name = "", looks = 0, drawn = {}, held = null, whole = false;
 
 export function open(main, worker_id) {
-  name = worker_id; looks = 0; drawn = {};
+  name = worker_id; looks = 0; drawn = {}; whole = false;
   main.replaceChildren(
     h("section", {}, h("h2", {}, h("a", {href: "#workers"}, "All workers")), h("p", {class: "instruction", id: "title"}, worker_id),
       h("div", {class: "bar"}, h("span", {id: "command"}), h("span", {id: "allowed", class: "muted"}), h("span", {id: "answer", class: "bad", role: "alert"})), h("div", {id: "facts"})),
     h("section", {class: "half", hidden: true}, h("h2", {}, "CPU ", h("small", {id: "cpunow"})), h("div", {id: "cpu", role: "img", "aria-label": "CPU use of the machine in the last half hour"})),
     h("section", {class: "half", hidden: true}, h("h2", {}, "Memory ", h("small", {id: "memorynow"})), h("div", {id: "memory", role: "img", "aria-label": "memory use of the machine in the last half hour"})),
     h("section", {class: "wide machine", hidden: true}, none("The worker does not report the use of its machine: it is older than this manager, or has joined just now.")),
-    h("section", {hidden: true}, h("h2", {}, "Scenes"), h("div", {id: "scenes"})),
-    h("section", {hidden: true}, h("h2", {}, "Log ", h("small", {}, "last lines of the worker, without secrets; times are UTC")), h("div", {id: "log"})));
+    h("section", {hidden: true}, h("h2", {}, "Log ", h("small", {}, "last lines of the worker, without secrets; times are UTC")), h("div", {id: "log"})),
+    h("section", {hidden: true}, h("h2", {}, "Scenes ", h("small", {id: "held"})), h("div", {id: "scenes"}), h("div", {class: "bar"}, h("button", {type: "button", id: "all", hidden: true, onclick: () => { whole = true; drawScenes(); }}))));
+}
+
+/** Draw the scenes that the worker holds: the first ones, or all on wish. A worker of a training run holds hundreds. */
+function drawScenes() {
+  const {residents, loads} = held, rows = [...residents.map(scene), ...loads.map(digest => h("tr", {}, h("td", {class: "named"}, h("code", {title: digest}, named(digest))), h("td", {class: "fit"}, "requested"), h("td"), h("td"), h("td")))];
+  const shown = whole ? rows : rows.slice(0, SCENES);
+  at("held").textContent = rows.length ? count(rows.length) : "";
+  at("all").hidden = shown.length === rows.length;
+  at("all").textContent = `Show all ${count(rows.length)}`;
+  put(at("scenes"), rows.length ? table(["scene", "state", ["load time", "n"], ["memory", "n"], "message"], shown, "scenes of the worker", "loose") : none("It holds no scene."));
 }
 
 export function close() {
@@ -37,8 +49,8 @@ export async function show() {
     for (const id of ["scenes", "log"]) at(id).closest("section").hidden = false;
     about(worker);
     machine(worker, host);
-    const rows = [...worker.residents.map(scene), ...worker.loads.map(digest => h("tr", {}, h("td", {class: "named"}, h("code", {title: digest}, named(digest))), h("td", {class: "fit"}, "requested"), h("td"), h("td"), h("td")))];
-    put(at("scenes"), rows.length ? table(["scene", "state", ["load time", "n"], ["memory", "n"], "message"], rows, "scenes of the worker", "loose") : none("It holds no scene."));
+    held = worker;
+    drawScenes();
     put(at("log"), lines.length ? h("pre", {class: "log", tabindex: "0"}, lines.join("\n")) : none("The worker has sent no lines: it has joined just now, runs with --no-send-log, or is older than this manager."));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
