@@ -188,7 +188,7 @@ def first_hour(
         return [*figures, *_trainer_image()]
 
     with refusals():
-        hand_in(_measured("first hour", measure), json_file)
+        hand_in(_measured("first-hour", measure), json_file)
         for note in notes:
             console.print(note, highlight=False)
 
