@@ -40,13 +40,9 @@ def draw_sheet(scenes: Sequence[Scene], *, columns: int = 9, cell_px: int = 200)
 
 
 def draw_oblique(scene: Scene, size_px: tuple[int, int]) -> Image.Image:
-    """Return an oblique view. It is rendered at twice the size, since Bullet's renderer does no antialiasing.
-
-    Raises EngineError without pybullet.
-    """
+    """Return an oblique view. Raises EngineError without pybullet."""
     width, height = size_px
-    view = render_oblique(scene, width_px=2 * width, height_px=2 * height)
-    return Image.fromarray(np.asarray(view)).resize(size_px, Image.Resampling.LANCZOS)
+    return Image.fromarray(np.asarray(render_oblique(scene, width_px=width, height_px=height)))
 
 
 def draw_views(scenes: Sequence[Scene], *, width_px: int = 560) -> Image.Image:
