@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from embomatrix.sim.bullet.photograph import Photographer
+from embomatrix.sim.bullet.photograph import Photo, Photographer
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.looks.view import View
@@ -44,11 +44,7 @@ def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) 
 
     Returns RGB values, shape (height, width, 3). Raises EngineError if pybullet is missing.
     """
-    with VisualScene(scene) as stage:
-        furnish_cutaway(stage)
-        stage.add_robot().stand(tucked(_start(scene)))
-        view, region = oblique_view(scene.rooms, width_px / height_px), _box_of(scene.rooms)
-        return Photographer(stage).shoot(view, region, width_px, height_px, outdoors=False)
+    return photograph_oblique(scene, width_px=width_px, height_px=height_px).pixels
 
 
 def render_egocentric(
@@ -58,17 +54,30 @@ def render_egocentric(
 
     Returns RGB values, shape (4, height, width, 3). Raises EngineError if pybullet is missing.
     """
-    start = stand or _start(scene)
+    photos = photograph_around(scene, stand, width_px=width_px, height_px=height_px)
+    return np.stack([photo.pixels for photo in photos])
+
+
+def photograph_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) -> Photo:
+    """Render the whole scene as `render_oblique` does, with the objects that the picture shows."""
+    with VisualScene(scene) as stage:
+        furnish_cutaway(stage)
+        stage.add_robot().stand(tucked(start_of(scene)))
+        view = oblique_view(scene.rooms, width_px / height_px)
+        return Photographer(stage).shoot(view, box_of(scene.rooms), width_px, height_px)
+
+
+def photograph_around(
+    scene: Scene, stand: StandPose | None = None, *, width_px: int = 320, height_px: int = 240
+) -> tuple[Photo, ...]:
+    """Render four views as `render_egocentric` does, with the objects that each shows."""
+    start = stand or start_of(scene)
     with VisualScene(scene) as stage:
         furnish_whole(stage)
-        photographer, region = Photographer(stage), _surroundings(scene, start)
-        views = [
-            eye_view(replace(start, yaw=start.yaw + turns * math.pi / 2), width_px / height_px)
-            for turns in range(4)
-        ]
-        return np.stack(
-            [photographer.shoot(view, region, width_px, height_px, outdoors=True) for view in views]
-        )
+        photographer, region = Photographer(stage), surroundings(scene, start)
+        quarters = (replace(start, yaw=start.yaw + turns * math.pi / 2) for turns in range(4))
+        views = [eye_view(quarter, width_px / height_px) for quarter in quarters]
+        return tuple(photographer.shoot(view, region, width_px, height_px, outdoors=True) for view in views)
 
 
 def furnish_cutaway(stage: VisualScene) -> None:
@@ -104,7 +113,7 @@ def shoot_egocentric(
 
 def oblique_view(rooms: tuple[Room, ...], aspect: float) -> View:
     """Return the view of a camera outside and above that sees all of these rooms."""
-    box = _box_of(rooms)
+    box = box_of(rooms)
     target, distance = _framing(np.array(box.low_m), np.array(box.high_m), aspect)
     eye = (target + _direction() * distance).tolist()
     return View.toward(eye, target.tolist(), FIELD_OF_VIEW, aspect, 0.5 * distance, 2.0 * distance)
@@ -119,7 +128,7 @@ def eye_view(stand: StandPose, aspect: float) -> View:
     return View.toward(eye, target, EYE_FIELD_OF_VIEW, aspect, EYE_NEAR_M, EYE_FAR_M)
 
 
-def _box_of(rooms: tuple[Room, ...]) -> Aabb:
+def box_of(rooms: tuple[Room, ...]) -> Aabb:
     """Return the box of rooms up to the height that oblique pictures show."""
     low, high = (
         np.min([room.low_m for room in rooms], axis=0),
@@ -129,15 +138,16 @@ def _box_of(rooms: tuple[Room, ...]) -> Aabb:
     return Aabb((float(low[0]), float(low[1]), 0.0), (float(high[0]), float(high[1]), height))
 
 
-def _surroundings(scene: Scene, stand: StandPose) -> Aabb:
+def surroundings(scene: Scene, stand: StandPose) -> Aabb:
     """Return the part of the scene near a standing pose: its shadows are drawn."""
-    whole = _box_of(scene.rooms)
+    whole = box_of(scene.rooms)
     low = [max(bound, at - NEAR_M) for bound, at in zip(whole.low_m, (stand.x_m, stand.y_m), strict=False)]
     high = [min(bound, at + NEAR_M) for bound, at in zip(whole.high_m, (stand.x_m, stand.y_m), strict=False)]
     return Aabb((low[0], low[1], 0.0), (high[0], high[1], whole.high_m[2]))
 
 
-def _start(scene: Scene) -> StandPose:
+def start_of(scene: Scene) -> StandPose:
+    """Return the standing pose of the robot at the start."""
     return StandPose(scene.robot.x_m, scene.robot.y_m, scene.robot.yaw)
 
 

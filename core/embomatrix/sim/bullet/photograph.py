@@ -1,5 +1,6 @@
 """Fine pictures of a scene: Bullet's renderer gives depths and bodies, `looks` gives materials, soft light and sky."""
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,6 +20,24 @@ BESIDE_WALL_M: Final = 0.13
 """Walls within this distance of a room get its colour."""
 
 
+@dataclass(frozen=True, slots=True)
+class SeenObject:
+    """Object in a picture: its name, the pixel in the middle of what is seen of it, and the number of its pixels."""
+
+    name: str
+    column: int
+    row: int
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Photo:
+    """Picture as RGB values, shape (height, width, 3), and the objects that it shows, largest first."""
+
+    pixels: NDArray[np.uint8]
+    seen: tuple[SeenObject, ...]
+
+
 class Photographer:
     """Takes fine pictures of one stage. Light maps are kept until an object moves or another region is lit."""
 
@@ -29,9 +48,9 @@ class Photographer:
         self._maps: tuple[ShadowMap, ...] = ()
 
     def shoot(
-        self, view: View, region: Aabb, width_px: int, height_px: int, *, outdoors: bool
-    ) -> NDArray[np.uint8]:
-        """Render a view with soft light in a region: RGB values, shape (height, width, 3).
+        self, view: View, region: Aabb, width_px: int, height_px: int, *, outdoors: bool = False
+    ) -> Photo:
+        """Render a view with soft light in a region.
 
         ``outdoors`` shows sky and ground beside the house instead of a white page. The region is the part of the scene whose
         shadows are drawn; everything outside is lit.
@@ -44,7 +63,27 @@ class Photographer:
         rendering = Rendering(view, buffers.depth, row_of[buffers.body], buffers.color)
         parts = [self._stage.parts[body] for body in bodies]
         table = table_of([(seen.part, seen.pose, seen.material) for seen in parts], self._planes)
-        return shaded(rendering, table, self._light(region), self._tints(bodies), outdoors=outdoors)
+        pixels = shaded(rendering, table, self._light(region), self._tints(bodies), outdoors=outdoors)
+        return Photo(pixels, self._seen(buffers.body[::FINER, ::FINER]))
+
+    def _seen(self, body: NDArray[np.int32]) -> tuple[SeenObject, ...]:
+        """Return the objects on a map of bodies, shape (height, width)."""
+        owners = self._stage.owners
+        names = sorted(set(owners.values()))
+        number_of = np.full(max([*owners, int(body.max())], default=0) + 2, -1, np.int32)
+        number_of[[*owners]] = [names.index(name) for name in owners.values()]
+        numbers = number_of[body]
+        rows, columns = np.nonzero(numbers >= 0)
+        found = numbers[rows, columns]
+        order = np.argsort(found, kind="stable")
+        kinds, first = np.unique(found[order], return_index=True)
+        seen = []
+        for kind, points in zip(kinds.tolist(), np.split(order, first[1:]), strict=False):
+            # The middle of a table may be hidden or between its legs: the pixel of the object next to it counts.
+            apart = np.hypot(rows[points] - rows[points].mean(), columns[points] - columns[points].mean())
+            nearest = points[int(np.argmin(apart))]
+            seen.append(SeenObject(names[kind], int(columns[nearest]), int(rows[nearest]), len(points)))
+        return tuple(sorted(seen, key=lambda each: (-each.pixels, each.name)))
 
     def _light(self, region: Aabb) -> tuple[ShadowMap, ...]:
         if self._lit != (self._stage.moves, region):

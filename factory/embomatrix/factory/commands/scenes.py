@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from PIL import Image
 from rich.console import Console
@@ -20,14 +19,20 @@ from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.pictures.relations import draw_relations
 from embomatrix.factory.pictures.scene import draw_plan
-from embomatrix.factory.pictures.sheet import draw_eyes, draw_sheet, draw_views
+from embomatrix.factory.pictures.sheet import (
+    draw_eyes,
+    draw_oblique,
+    draw_sheet,
+    draw_tagged_eyes,
+    draw_tagged_oblique,
+    draw_views,
+)
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.host.commands import command_group
 from embomatrix.host.limits import usable_cores
-from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import write_whole
@@ -67,6 +72,12 @@ Kind = Annotated[
         "by side; or examples and counterexamples of every relation, without scenes.",
     ),
 ]
+LabelsOption = Annotated[
+    bool,
+    typer.Option(
+        "--labels", help="Write the names of visible objects into the oblique view and the robot's view."
+    ),
+]
 Jobs = Annotated[int, typer.Option(min=1, help="Number of processes.")]
 Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and objects left out.")
@@ -75,6 +86,8 @@ Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets tha
 Background = Annotated[
     bool, typer.Option(help="Fill homes with background objects, as many as real rooms hold.")
 ]
+VIEW_PX = (1280, 960)
+"""Size of the oblique view of a scene."""
 CORES = usable_cores()
 _user_errors = partial(user_errors, more=(FloorPlanError, ModelFileError, SceneFileError))
 LEFT_OUT = "for objects that were left out, and why: `embomatrix scene show NAME`, or --report FILE"
@@ -175,8 +188,14 @@ def draw(
     kind: Kind = Drawing.SCENE,
     seed: Seed = 0,
     out: Out = Path(),
+    labels: LabelsOption = False,
 ) -> None:
     """Draw scenes or examples of the relations as PNG files in a folder."""
+    if labels and kind is not Drawing.SCENE:
+        fail(
+            f"found --labels with --as {kind}: names are written into the oblique view and the robot's view of single "
+            f"scenes; leave out --labels, or leave out --as"
+        )
     names = () if kind is Drawing.RELATIONS else _chosen(scenes, every)
     with _user_errors(out):
         for name in names:
@@ -184,12 +203,21 @@ def draw(
         out.mkdir(parents=True, exist_ok=True)
         with progress() as bars:
             built = [_built(name, seed) for name in bars.track(names, description="scenes")]
-        for title, picture in _pictures(kind, built):
+        pictures = _tagged_pictures(built) if labels else _pictures(kind, built)
+        for title, picture in pictures:
             buffer = io.BytesIO()
             picture.save(buffer, format="PNG", optimize=True)
             file = out / f"{title}.png"
             write_whole(file, buffer.getvalue())
             say(file)
+
+
+def _tagged_pictures(scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
+    """Yield the pictures of each scene, with names in all of them. Raise EngineError without pybullet."""
+    for scene in scenes:
+        yield f"{scene.scene_id}_plan", draw_plan(scene)
+        yield f"{scene.scene_id}_view", draw_tagged_oblique(scene, VIEW_PX)
+        yield f"{scene.scene_id}_eyes", draw_tagged_eyes(scene)
 
 
 def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
@@ -198,7 +226,7 @@ def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[tuple[str, Ima
         case Drawing.SCENE:
             for scene in scenes:
                 yield f"{scene.scene_id}_plan", draw_plan(scene)
-                yield f"{scene.scene_id}_view", Image.fromarray(np.asarray(render_oblique(scene)))
+                yield f"{scene.scene_id}_view", draw_oblique(scene, VIEW_PX)
                 yield f"{scene.scene_id}_eyes", draw_eyes(scene)
         case Drawing.SHEET:
             yield "sheet", draw_sheet(scenes).quantize(64)

@@ -201,4 +201,4 @@ def _photographed(
     eye = (x + 2.6 * span, y + panel.side * span, z + panel.above * span)
     view = View.toward(eye, (x, y, z), 32.0, PANEL_PX[0] / PANEL_PX[1], 0.05, 50.0)
     lit = Aabb((x - span, y - span, z - span), (x + span, y + span, z + span))
-    return Photographer(stage).shoot(view, lit, *PANEL_PX, outdoors=False)
+    return Photographer(stage).shoot(view, lit, *PANEL_PX).pixels
