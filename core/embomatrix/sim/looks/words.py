@@ -9,15 +9,15 @@ WORDS: Final[dict[Kind, str]] = {
     Kind.OAK: """
         arbor background bar_stool baseball_bat baseboard bed bench bird_feeder birdcage board bookcase bookcase_back
         bookcase_baseboard bookcase_shelf bookcase_side bookcase_top bookend booth breakfast_table bulletin_board
-        bunk_bed cabinet_door candy_dispenser_shelf checkout_counter chess_set chicken_coop chopping_block
+        bunk_bed cabinet_door candy_dispenser_shelf chair checkout_counter chess_set chicken_coop chopping_block
         chopping_board chopstick classroom_mock_up coatrack coffee_table commercial_kitchen_table console_table crib
         cutting_board dartboard desk desk_bracket desk_leg desk_top dessert_stand display_case door dowel
-        dry_food_dispenser_shelf easel farm_stand firewood floors frame garden_chair garden_coffee_table gate
-        golf_club guitar hall_tree highchair hockey_stick hutch knife_block lab_table ladder log loin magazine_rack
-        magazine_stand mallet match music_stool nativity_figurine nightstand paddle pallet parallel_bars pedestal
-        pegboard pergola pestle picture_frame plywood pool_stick rail_fence reception_desk rocking_chair rolling_pin
-        sauna_bench shelf shoe_rack signpost skateboard_deck stairs stake stand stool straight_chair
-        structural_element taboret toothpick toy_box toy_figure toy_train tray umbrella_rack violin walker
+        dry_food_dispenser_shelf easel farm_stand firewood floors frame furniture garden_chair garden_coffee_table
+        gate golf_club guitar hall_tree highchair hockey_stick hutch knife_block lab_table ladder log loin
+        magazine_rack magazine_stand mallet match music_stool nativity_figurine nightstand paddle pallet parallel_bars
+        pedestal pegboard pergola pestle picture_frame plywood pool_stick rail_fence reception_desk rocking_chair
+        rolling_pin sauna_bench shelf shoe_rack signpost skateboard_deck stairs stake stand stool straight_chair
+        structural_element table taboret toothpick toy_box toy_figure toy_train tray umbrella_rack violin walker
         wooden_spoon""",
     Kind.WALNUT: """
         antlers bar bust cedar_chest cigar conference_table gaming_table grandfather_clock jukebox pedestal_table
