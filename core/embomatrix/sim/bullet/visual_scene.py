@@ -33,6 +33,9 @@ OUT_OF_SIGHT: Final = Pose((0.0, 0.0, -100.0))
 _PANEL_M: Final = 0.1
 _PANE_M: Final = 0.03
 """Thinner walls are door panels (first) and window panes (second)."""
+_AMBIENT: Final = 0.68
+_DIFFUSE: Final = 0.32
+"""Shares of a colour that surfaces show in flat pictures, away from the light and towards it."""
 _CEILING_M: Final = 0.02
 """Height of a ceiling above the tops of its walls."""
 
@@ -125,8 +128,7 @@ class VisualScene:
         """Add the background objects at their places."""
         for item in self.scene.background:
             asset = self.scene.assets[item.asset_id]
-            # Books of one category stand side by side: each model has its own colour.
-            materials = iter(part_materials(asset, salt=item.asset_id))
+            materials = iter(part_materials(asset))
             for link in asset.links:
                 for part in link.parts:
                     self._add_part(part, item.pose_world_asset, next(materials))
@@ -163,6 +165,8 @@ class VisualScene:
             view.lens_matrix,
             shadow=0,
             lightDirection=(0.5, -0.8, 2.0),
+            lightAmbientCoeff=_AMBIENT,
+            lightDiffuseCoeff=_DIFFUSE,
             renderer=self._bullet.ER_TINY_RENDERER,
         )
         size = (height_px, width_px)

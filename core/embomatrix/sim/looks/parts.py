@@ -25,12 +25,12 @@ _LIGHTER: Final = 0.25
 """Share by which doors and drawers are lighter than the body that they close."""
 
 
-def part_materials(asset: Asset, *, salt: str = "") -> list[Material]:
+def part_materials(asset: Asset) -> list[Material]:
     """Return the materials of the parts of all links, in order.
 
-    Categories with many colours, such as books, differ by category and by ``salt``.
+    Models of things with many colours, such as books, differ from one another.
     """
-    body = material_of(asset.category, large=max(asset.size_m) >= _LARGE_M, salt=salt)
+    body = material_of(asset.category, large=max(asset.size_m) >= _LARGE_M, salt=asset.asset_id)
     parts = [part for link in asset.links for part in link.parts]
     return [
         _moving(asset.category, body) if number else _still(asset, parts, part, body)

@@ -125,7 +125,7 @@ def _planks() -> Tile:
     along = (_COLUMNS + shift) % 1.0
     tone = tones[row, (along > 0.5).astype(int)]
     seam = (np.abs((_ROWS * count) % 1.0 - 0.5) > 0.47) | (np.abs((along * 2) % 1.0 - 0.5) > 0.494)
-    return _tile(1.0 + tone + 0.04 * _noise(4, 70, 3) - 0.28 * seam, tint=(-0.2, 0.0, 0.25))
+    return _tile(1.0 + tone + 0.03 * _noise(4, 40, 3) - 0.28 * seam, tint=(-0.2, 0.0, 0.25))
 
 
 def _tiles() -> Tile:
@@ -133,7 +133,7 @@ def _tiles() -> Tile:
     joint = (np.minimum(row, 1 - row) < 0.02) | (np.minimum(column, 1 - column) < 0.02)
     tones = np.random.default_rng(5).uniform(-0.05, 0.05, (2, 2))
     tone = tones[(_ROWS * 2).astype(int), (_COLUMNS * 2).astype(int)]
-    return _tile(1.0 + tone + 0.015 * _noise(6, 12, 12) - 0.25 * joint)
+    return _tile(1.0 + tone + 0.01 * _noise(6, 6, 6) - 0.25 * joint)
 
 
 def _carpet() -> Tile:
@@ -154,7 +154,7 @@ def _rug() -> Tile:
 
 
 def _brushed() -> Tile:
-    return _tile(1.0 + 0.03 * _noise(11, 100, 2))
+    return _tile(1.0 + 0.02 * _noise(11, 60, 2))
 
 
 def _stone() -> Tile:
@@ -163,7 +163,7 @@ def _stone() -> Tile:
 
 
 def _plaster() -> Tile:
-    return _tile(1.0 + 0.012 * _noise(14, 90, 90) + 0.015 * _noise(15, 4, 4))
+    return _tile(1.0 + 0.015 * _noise(14, 4, 4))
 
 
 def _leaves() -> Tile:

@@ -45,12 +45,12 @@ def floor_of(room_type: str) -> Material:
     if room_type in _OFFICES:
         return Material((0.52, 0.55, 0.60), Pattern.CARPET)
     if room_type in _BEDROOMS:
-        return Material((0.76, 0.60, 0.42), Pattern.PLANKS, gloss=0.02)
+        return Material((0.74, 0.66, 0.56), Pattern.PLANKS, gloss=0.02)
     if room_type in _CONCRETE:
         return Material((0.70, 0.68, 0.65), Pattern.STONE)
     if room_type in _HALLS:
         return Material((0.84, 0.82, 0.77), Pattern.TILES, gloss=0.06)
-    return Material((0.68, 0.50, 0.34), Pattern.PLANKS, gloss=0.03)
+    return Material((0.57, 0.47, 0.39), Pattern.PLANKS, gloss=0.03)  # darker and greyer than furniture
 
 
 def wall_of(room_type: str) -> Rgb:

@@ -140,7 +140,9 @@ def _surface_colors(
 ) -> FloatArray:
     book = atlas()
     surface = surface_points(table, row, points, rays, book.tile_m)
-    factor, white = book.look_up(table.pattern[row], surface.u, surface.v, texel_m / surface.tile_m)
+    factor, white = book.look_up(
+        table.pattern[row], surface.u, surface.v, texel_m / (surface.tile_m * surface.slant)
+    )
     color = table.color[row]
     _tint_walls(color, tints, row, points, surface.normal)
     color = color * factor

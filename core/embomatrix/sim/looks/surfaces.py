@@ -15,7 +15,15 @@ FloatArray = NDArray[np.float32]
 IntArray = NDArray[np.signedinteger[Any]]
 
 _SHAPES: Final = tuple(Shape)
-_ROUNDING: Final = 0.04
+_PATTERNS: Final = tuple(Pattern)
+_LABELS: Final = np.array([pattern is Pattern.LABEL for pattern in Pattern])
+"""Labels go round the sides of a part; other patterns that fill a face are on the two largest faces."""
+_UP: Final = 2
+_FLATTEST: Final = 0.05
+"""Least cosine of the angle at which textures are seen."""
+_MARGIN: Final = 0.004
+"""Position at the margin of a tile, whose colour the other faces have."""
+_ROUNDING: Final = 0.07
 """Share of a hull's size over which its edges look rounded."""
 THINNEST_M: Final = 0.002
 """Thinner boxes are drawn this thick."""
@@ -51,6 +59,8 @@ class SurfacePoints:
     v: FloatArray
     tile_m: FloatArray
     """Size of a tile at the point, the smaller side."""
+    slant: FloatArray
+    """Share of its length that a short line on the surface has in the picture, in the mean of both directions."""
 
 
 def table_of(parts: Sequence[tuple[ConvexPart, Pose, Material]], planes: "HullPlanes") -> PartTable:
@@ -89,9 +99,6 @@ class HullPlanes:
         return planes
 
 
-_PATTERNS: Final = tuple(Pattern)
-
-
 def surface_points(
     table: PartTable, row: IntArray, points: FloatArray, rays: FloatArray, tile_m: FloatArray
 ) -> SurfacePoints:
@@ -114,19 +121,24 @@ def surface_points(
     # Grain and planks run along the longer side of a part.
     turned = ~fills & (high > wide)
     a, b = np.where(turned, b, a), np.where(turned, a, b)
+    thinnest = np.argmin(half, axis=1)
+    blank = fills & np.where(_LABELS[table.pattern[row]], axis == _UP, axis != thinnest)
     salt = (row % 97) * np.float32(0.131)
     u = np.where(fills, a / (2 * wide) + 0.5, a / np.where(fills, 1.0, tile) + salt)
     v = np.where(fills, 0.5 - b / (2 * high), b / np.where(fills, 1.0, tile) + salt)
+    u[blank] = v[blank] = _MARGIN
     size = np.where(fills, 2 * np.minimum(wide, high), tile)
     world = np.einsum("nij,nj->ni", rotation, normal)
+    toward = np.einsum("ni,ni->n", world, rays)
     # Thin parts, such as ceilings, are seen from both sides.
-    world[np.einsum("ni,ni->n", world, rays) > 0] *= -1
+    world[toward > 0] *= -1
     return SurfacePoints(
         row,
         world,
         u.astype(np.float32),
         v.astype(np.float32),
         size.astype(np.float32),
+        np.sqrt(np.maximum(np.abs(toward), _FLATTEST)),
     )
 
 

@@ -4,6 +4,7 @@ import io
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -49,6 +50,22 @@ class Drawing(StrEnum):
     RELATIONS = "relations"
 
 
+class PictureFormat(StrEnum):
+    """Formats of rendered pictures; the value is the suffix of the file."""
+
+    PNG = "png"
+    JPEG = "jpg"
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePicture:
+    """Picture with the name of its file without suffix; a ``rendered`` one has soft shades, any other lines and text."""
+
+    title: str
+    image: Image.Image
+    rendered: bool = False
+
+
 SceneIds = Annotated[list[str] | None, typer.Argument(help="Names of scenes; none with --all.")]
 SceneSource = Annotated[
     str,
@@ -78,6 +95,12 @@ LabelsOption = Annotated[
         "--labels", help="Write the names of visible objects into the oblique view and the robot's view."
     ),
 ]
+FormatOption = Annotated[
+    PictureFormat,
+    typer.Option(
+        "--format", help="Format of rendered pictures; JPEG files are smaller. Plans are PNG files."
+    ),
+]
 Jobs = Annotated[int, typer.Option(min=1, help="Number of processes.")]
 Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and objects left out.")
@@ -86,6 +109,7 @@ Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets tha
 Background = Annotated[
     bool, typer.Option(help="Fill homes with background objects, as many as real rooms hold.")
 ]
+JPEG_QUALITY = 85
 VIEW_PX = (1280, 960)
 """Size of the oblique view of a scene."""
 CORES = usable_cores()
@@ -189,6 +213,7 @@ def draw(
     seed: Seed = 0,
     out: Out = Path(),
     labels: LabelsOption = False,
+    file_format: FormatOption = PictureFormat.PNG,
 ) -> None:
     """Draw scenes or examples of the relations as PNG files in a folder."""
     if labels and kind is not Drawing.SCENE:
@@ -203,37 +228,45 @@ def draw(
         out.mkdir(parents=True, exist_ok=True)
         with progress() as bars:
             built = [_built(name, seed) for name in bars.track(names, description="scenes")]
-        pictures = _tagged_pictures(built) if labels else _pictures(kind, built)
-        for title, picture in pictures:
-            buffer = io.BytesIO()
-            picture.save(buffer, format="PNG", optimize=True)
-            file = out / f"{title}.png"
-            write_whole(file, buffer.getvalue())
-            say(file)
+        for picture in _tagged_pictures(built) if labels else _pictures(kind, built):
+            say(_written(picture, out, file_format))
 
 
-def _tagged_pictures(scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
+def _written(picture: ScenePicture, out: Path, file_format: PictureFormat) -> Path:
+    """Write a picture into a folder and return its path."""
+    used = file_format if picture.rendered else PictureFormat.PNG
+    buffer = io.BytesIO()
+    if used is PictureFormat.PNG:
+        picture.image.save(buffer, format="PNG", optimize=True)
+    else:
+        picture.image.save(buffer, format="JPEG", optimize=True, quality=JPEG_QUALITY)
+    file = out / f"{picture.title}.{used}"
+    write_whole(file, buffer.getvalue())
+    return file
+
+
+def _tagged_pictures(scenes: Sequence[Scene]) -> Iterator[ScenePicture]:
     """Yield the pictures of each scene, with names in all of them. Raise EngineError without pybullet."""
     for scene in scenes:
-        yield f"{scene.scene_id}_plan", draw_plan(scene)
-        yield f"{scene.scene_id}_view", draw_tagged_oblique(scene, VIEW_PX)
-        yield f"{scene.scene_id}_eyes", draw_tagged_eyes(scene)
+        yield ScenePicture(f"{scene.scene_id}_plan", draw_plan(scene))
+        yield ScenePicture(f"{scene.scene_id}_view", draw_tagged_oblique(scene, VIEW_PX), rendered=True)
+        yield ScenePicture(f"{scene.scene_id}_eyes", draw_tagged_eyes(scene), rendered=True)
 
 
-def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
-    """Yield pictures of a kind with their titles. Raise EngineError without pybullet."""
+def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[ScenePicture]:
+    """Yield pictures of a kind. Raise EngineError without pybullet."""
     match kind:
         case Drawing.SCENE:
             for scene in scenes:
-                yield f"{scene.scene_id}_plan", draw_plan(scene)
-                yield f"{scene.scene_id}_view", draw_oblique(scene, VIEW_PX)
-                yield f"{scene.scene_id}_eyes", draw_eyes(scene)
+                yield ScenePicture(f"{scene.scene_id}_plan", draw_plan(scene))
+                yield ScenePicture(f"{scene.scene_id}_view", draw_oblique(scene, VIEW_PX), rendered=True)
+                yield ScenePicture(f"{scene.scene_id}_eyes", draw_eyes(scene), rendered=True)
         case Drawing.SHEET:
-            yield "sheet", draw_sheet(scenes).quantize(64)
+            yield ScenePicture("sheet", draw_sheet(scenes).quantize(64))
         case Drawing.VIEWS:
-            yield "views", draw_views(scenes).quantize(128)
+            yield ScenePicture("views", draw_views(scenes), rendered=True)
         case Drawing.RELATIONS:
-            yield "relations", draw_relations().quantize(64)
+            yield ScenePicture("relations", draw_relations(), rendered=True)
 
 
 def _run(orders: Sequence[SceneBuildJob], jobs: int) -> list[SceneReport]:
