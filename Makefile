@@ -85,10 +85,10 @@ wheel: $(VENV)/.dev
 	$(BIN)/python -m build --no-isolation --outdir build/dist
 
 pictures: $(VENV)/.dev
-	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --out docs/pictures
-	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --out docs/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --format jpg --out docs/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --format jpg --out docs/pictures
 	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures
-	$(BIN)/embomatrix scene draw --as relations --out docs/pictures
+	$(BIN)/embomatrix scene draw --as relations --format jpg --out docs/pictures
 
 clean:
 	rm -rf build runs
