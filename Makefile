@@ -89,6 +89,7 @@ pictures: $(VENV)/.dev
 	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --format jpg --out docs/pictures
 	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures
 	$(BIN)/embomatrix scene draw --as relations --format jpg --out docs/pictures
+	$(BIN)/embomatrix play Rs_int-train-000-03 --oracle --mode physical --film docs/pictures/physical.gif
 
 clean:
 	rm -rf build runs
