@@ -73,7 +73,7 @@ def shaded(
     rows, columns, target, weight = _samples(rendering.part)
     colors = _colors(rendering, table, maps, tints, rows, columns, outdoors=outdoors)
     np.minimum(colors, 1.0, out=colors)
-    # Samples of one pixel are neighbours in target order: the first of each pixel is in place before the others are added.
+    # A pixel has either one sample of full weight, or four whose mean it shows.
     single = weight == 1.0
     picture[target[single]] = colors[single]
     rest = ~single
