@@ -201,6 +201,12 @@ COMMANDS = (
         "give one of them",
     ),
     CommandCase("no import source", "factory import", "0 sources", "expected exactly one of --bddl FILE"),
+    CommandCase(
+        "names in a sheet of plans",
+        "scene draw Rs_int --as sheet --labels --out=FILES/new",
+        "--as sheet",
+        "leave out --labels",
+    ),
     CommandCase("no scene named", "scene build --out=FILES/new", "no scene", "give a name"),
     CommandCase(
         "scene and --all", "scene build Rs_int --all --out=FILES/new", "Rs_int", "give names or --all"

@@ -206,6 +206,15 @@ def _trainer_image() -> list[Figure]:
 
 
 @app.command()
+def pictures(json_file: Json = None) -> None:
+    """Measure the CPU time of pictures of base scenes; needs no dataset."""
+    from embomatrix.bench.pictures.renders import bench_renders
+
+    with refusals():
+        hand_in(_measured("pictures", bench_renders), json_file)
+
+
+@app.command()
 def traffic(
     record: Annotated[
         Path | None,

@@ -10,7 +10,18 @@ from typer.testing import CliRunner
 from embomatrix.factory.commands.scenes import app
 from embomatrix.factory.pictures.scene import FILL, draw_plan
 from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
-from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.sim.bullet.camera import (
+    box_of,
+    furnish_cutaway,
+    furnish_whole,
+    oblique_view,
+    photograph_oblique,
+    render_oblique,
+)
+from embomatrix.sim.bullet.photograph import Photographer
+from embomatrix.sim.bullet.visual_scene import VisualScene
+from embomatrix.sim.looks.rooms import CEILING, PANE
+from embomatrix.sim.looks.view import View
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
@@ -88,6 +99,78 @@ def test_render_writes_plan_view_and_robot_view(tmp_path: Path) -> None:
         "hotel_suite_small_plan.png",
         "hotel_suite_small_view.png",
     ]
+
+
+def test_jpeg_replaces_rendered_pictures_and_leaves_plans(tmp_path: Path) -> None:
+    arguments = ["draw", "hotel_suite_small", "--labels", "--format", "jpg", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "hotel_suite_small_eyes.jpg",
+        "hotel_suite_small_plan.png",
+        "hotel_suite_small_view.jpg",
+    ]
+    assert (tmp_path / "hotel_suite_small_view.jpg").read_bytes()[:3] == b"\xff\xd8\xff"
+
+
+def test_labels_are_refused_where_no_names_fit(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["draw", "Rs_int", "--as", "sheet", "--labels", "--out", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "leave out --labels" in " ".join(result.output.split())
+    assert not any(tmp_path.iterdir())
+
+
+def test_equal_scenes_give_equal_pictures(flat: Scene) -> None:
+    first, second = (render_oblique(flat, width_px=160, height_px=120) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_photo_tells_the_objects_that_it_shows(flat: Scene) -> None:
+    photo = photograph_oblique(flat, width_px=320, height_px=240)
+    assert [each.pixels for each in photo.seen] == sorted((each.pixels for each in photo.seen), reverse=True)
+    names = {each.name for each in photo.seen}
+    large = [item for item in flat.objects if "bed" in item.name or "sofa" in item.name]
+    assert large
+    assert {item.name for item in large} <= names <= {item.name for item in flat.objects}
+    for each in photo.seen:
+        assert 0 <= each.column < 320
+        assert 0 <= each.row < 240
+
+
+def test_hidden_object_is_not_among_the_seen_ones(flat: Scene) -> None:
+    with VisualScene(flat) as stage:
+        furnish_cutaway(stage)
+        photographer, view, region = Photographer(stage), oblique_view(flat.rooms, 4 / 3), box_of(flat.rooms)
+        name = photographer.shoot(view, region, 160, 120).seen[0].name
+        before = photographer.shoot(view, region, 160, 120)
+        stage.hide(name)
+        after = photographer.shoot(view, region, 160, 120)
+    assert name in {each.name for each in before.seen}
+    assert name not in {each.name for each in after.seen}
+    assert (before.pixels != after.pixels).any()
+
+
+def test_furniture_casts_a_soft_shadow_on_the_floor(flat: Scene) -> None:
+    """Bright shades between light and shadow occur: a hard shadow has two."""
+    bare = replace(flat, objects=(), background=())
+    full, empty = (render_oblique(scene, width_px=320, height_px=240).astype(int) for scene in (flat, bare))
+    darker = (empty - full).mean(axis=2)
+    shades = darker[(darker > 4) & (darker < 60)]
+    assert len(shades) > 500
+    assert shades.std() > 5
+
+
+def test_rooms_have_ceilings_and_windows_have_panes(flat: Scene) -> None:
+    with VisualScene(flat) as stage:
+        furnish_whole(stage)
+        room = max(flat.rooms, key=lambda each: each.size_m[0] * each.size_m[1])
+        x, y = room.center_m
+        up = View.toward((x, y, 1.0), (x, y + 0.3, room.height_m), 30.0, 4 / 3, 0.05, 30.0)
+        buffers = stage.capture(up, 40, 30)
+        above = stage.parts[int(np.bincount(buffers.body[buffers.body >= 0]).argmax())]
+        panes = [seen for seen in stage.parts.values() if seen.material is PANE]
+    assert above.material is CEILING
+    assert len(panes) == len(flat.windows)
 
 
 def test_check_accepts_a_base_scene() -> None:

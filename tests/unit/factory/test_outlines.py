@@ -12,7 +12,7 @@ from embomatrix.factory.furnish.roles import role_of
 from embomatrix.factory.furnish.worktops import side_panels
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.check import check_scene
-from embomatrix.sim.bullet.visual_scene import part_colors
+from embomatrix.sim.looks.parts import part_materials
 from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import IDENTITY
@@ -61,10 +61,10 @@ def test_stand_rises_towards_its_back_with_a_seat_on_every_tier() -> None:
 def test_mirror_shows_pale_glass_in_a_dark_frame() -> None:
     model = CATALOG.models_of("mirror")[0].model_id
     assert family_of_model(CATALOG, "mirror", model) is Family.MIRROR
-    glass, *frame = part_colors(build_asset(CATALOG, "mirror", model))
-    assert min(glass[:3]) > 0.85
+    glass, *frame = part_materials(build_asset(CATALOG, "mirror", model))
+    assert min(glass.color) > 0.85
     assert len(frame) == 4
-    assert max(max(color[:3]) for color in frame) < 0.5
+    assert max(max(material.color) for material in frame) < 0.5
 
 
 def test_worktop_without_cabinets_stands_on_two_panels() -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a scene by Bullet's software renderer: oblique from above, and from the robot's camera."""
+"""Pictures of a scene, oblique from above and from the robot's camera: fine ones, and fast ones in flat colours for films."""
 
 import itertools
 import math
@@ -8,9 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from embomatrix.sim.bullet.photograph import Photo, Photographer
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.bullet.visual_scene import VisualScene
-from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose
+from embomatrix.sim.looks.view import View
+from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, Pose
 from embomatrix.world.poses import StandPose
 from embomatrix.world.scene import Room, Scene, SceneObject
 
@@ -33,6 +35,8 @@ EYE_FIELD_OF_VIEW: Final = 75.0
 """The robot's camera looks slightly down, to see the tops of nearby tables."""
 EYE_NEAR_M: Final = 0.05
 EYE_FAR_M: Final = 30.0
+NEAR_M: Final = 5.0
+"""Pictures of the robot's camera show shadows up to this distance on both axes."""
 
 
 def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) -> NDArray[np.uint8]:
@@ -40,10 +44,7 @@ def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) 
 
     Returns RGB values, shape (height, width, 3). Raises EngineError if pybullet is missing.
     """
-    with VisualScene(scene) as stage:
-        furnish_cutaway(stage)
-        stage.add_robot().stand(tucked(_start(scene)))
-        return shoot_oblique(stage, scene.rooms, width_px, height_px)
+    return photograph_oblique(scene, width_px=width_px, height_px=height_px).pixels
 
 
 def render_egocentric(
@@ -53,11 +54,30 @@ def render_egocentric(
 
     Returns RGB values, shape (4, height, width, 3). Raises EngineError if pybullet is missing.
     """
-    start = stand or _start(scene)
+    photos = photograph_around(scene, stand, width_px=width_px, height_px=height_px)
+    return np.stack([photo.pixels for photo in photos])
+
+
+def photograph_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) -> Photo:
+    """Render the whole scene as `render_oblique` does, with the objects that the picture shows."""
+    with VisualScene(scene) as stage:
+        furnish_cutaway(stage)
+        stage.add_robot().stand(tucked(start_of(scene)))
+        view = oblique_view(scene.rooms, width_px / height_px)
+        return Photographer(stage).shoot(view, box_of(scene.rooms), width_px, height_px)
+
+
+def photograph_around(
+    scene: Scene, stand: StandPose | None = None, *, width_px: int = 320, height_px: int = 240
+) -> tuple[Photo, ...]:
+    """Render four views as `render_egocentric` does, with the objects that each shows."""
+    start = stand or start_of(scene)
     with VisualScene(scene) as stage:
         furnish_whole(stage)
+        photographer, region = Photographer(stage), surroundings(scene, start)
         quarters = (replace(start, yaw=start.yaw + turns * math.pi / 2) for turns in range(4))
-        return np.stack([shoot_egocentric(stage, quarter, width_px, height_px) for quarter in quarters])
+        views = [eye_view(quarter, width_px / height_px) for quarter in quarters]
+        return tuple(photographer.shoot(view, region, width_px, height_px, outdoors=True) for view in views)
 
 
 def furnish_cutaway(stage: VisualScene) -> None:
@@ -69,8 +89,9 @@ def furnish_cutaway(stage: VisualScene) -> None:
 
 
 def furnish_whole(stage: VisualScene) -> None:
-    """Fill a stage for inside pictures: full walls and ceiling objects."""
+    """Fill a stage for inside pictures: full walls, ceilings and what hangs there."""
     stage.add_floors()
+    stage.add_ceilings()
     stage.add_walls(lambda wall: wall)
     stage.add_objects()
     stage.add_background()
@@ -79,29 +100,54 @@ def furnish_whole(stage: VisualScene) -> None:
 def shoot_oblique(
     stage: VisualScene, rooms: tuple[Room, ...], width_px: int, height_px: int
 ) -> NDArray[np.uint8]:
-    """Render these rooms obliquely, filling the picture."""
-    low = np.min([(*room.low_m, 0.0) for room in rooms], axis=0)
-    high = np.max([(*room.high_m, min(room.height_m, _SHOWN_M)) for room in rooms], axis=0)
-    aspect = width_px / height_px
-    target, distance = _framing(low, high, aspect)
-    view = stage.look_at((target + _direction() * distance).tolist(), target.tolist())
-    lens = stage.lens(FIELD_OF_VIEW, aspect, 0.5 * distance, 2.0 * distance)
-    return stage.shoot(view, lens, width_px, height_px)
+    """Render these rooms obliquely, filling the picture, in flat colours."""
+    return stage.shoot(oblique_view(rooms, width_px / height_px), width_px, height_px)
 
 
 def shoot_egocentric(
     stage: VisualScene, stand: StandPose, width_px: int, height_px: int
 ) -> NDArray[np.uint8]:
-    """Render the view of the robot's camera at a standing pose."""
+    """Render the view of the robot's camera at a standing pose, in flat colours."""
+    return stage.shoot(eye_view(stand, width_px / height_px), width_px, height_px)
+
+
+def oblique_view(rooms: tuple[Room, ...], aspect: float) -> View:
+    """Return the view of a camera outside and above that sees all of these rooms."""
+    box = box_of(rooms)
+    target, distance = _framing(np.array(box.low_m), np.array(box.high_m), aspect)
+    eye = (target + _direction() * distance).tolist()
+    return View.toward(eye, target.tolist(), FIELD_OF_VIEW, aspect, 0.5 * distance, 2.0 * distance)
+
+
+def eye_view(stand: StandPose, aspect: float) -> View:
+    """Return the view of the robot's camera at a standing pose."""
     flat = math.cos(EYE_PITCH)
     eye = (stand.x_m, stand.y_m, EYE_M)
     ahead = (flat * math.cos(stand.yaw), flat * math.sin(stand.yaw), math.sin(EYE_PITCH))
     target = tuple(start + step for start, step in zip(eye, ahead, strict=True))
-    lens = stage.lens(EYE_FIELD_OF_VIEW, width_px / height_px, EYE_NEAR_M, EYE_FAR_M)
-    return stage.shoot(stage.look_at(eye, target), lens, width_px, height_px)
+    return View.toward(eye, target, EYE_FIELD_OF_VIEW, aspect, EYE_NEAR_M, EYE_FAR_M)
 
 
-def _start(scene: Scene) -> StandPose:
+def box_of(rooms: tuple[Room, ...]) -> Aabb:
+    """Return the box of rooms up to the height that oblique pictures show."""
+    low, high = (
+        np.min([room.low_m for room in rooms], axis=0),
+        np.max([room.high_m for room in rooms], axis=0),
+    )
+    height = max(min(room.height_m, _SHOWN_M) for room in rooms)
+    return Aabb((float(low[0]), float(low[1]), 0.0), (float(high[0]), float(high[1]), height))
+
+
+def surroundings(scene: Scene, stand: StandPose) -> Aabb:
+    """Return the part of the scene near a standing pose: its shadows are drawn."""
+    whole = box_of(scene.rooms)
+    low = [max(bound, at - NEAR_M) for bound, at in zip(whole.low_m, (stand.x_m, stand.y_m), strict=False)]
+    high = [min(bound, at + NEAR_M) for bound, at in zip(whole.high_m, (stand.x_m, stand.y_m), strict=False)]
+    return Aabb((low[0], low[1], 0.0), (high[0], high[1], whole.high_m[2]))
+
+
+def start_of(scene: Scene) -> StandPose:
+    """Return the standing pose of the robot at the start."""
     return StandPose(scene.robot.x_m, scene.robot.y_m, scene.robot.yaw)
 
 

@@ -5,9 +5,8 @@ Every solid is a body without a collision shape. Shapes are shared; objects can 
 
 from __future__ import annotations
 
-import math
-import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -19,45 +18,48 @@ from embomatrix.sim.bullet.robot import Posture, load_robot, spread
 from embomatrix.sim.bullet.robot_model import DRIVEN_JOINTS
 from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.sim.geometry.door_leaves import door_leaves
-from embomatrix.skills.limits import ROBOT
-from embomatrix.world.asset import Asset
+from embomatrix.sim.looks.materials import Material
+from embomatrix.sim.looks.parts import part_materials
+from embomatrix.sim.looks.rooms import CEILING, DOOR_PANEL, PANE, WALL, floor_of
+from embomatrix.sim.looks.surfaces import THINNEST_M
+from embomatrix.sim.looks.view import View
 from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape, Vec3
 from embomatrix.world.scene import Scene, SceneObject
 
 FloatArray = NDArray[np.float64]
-Rgba = tuple[float, float, float, float]
 
 OUT_OF_SIGHT: Final = Pose((0.0, 0.0, -100.0))
 
-_WALL: Final[Rgba] = (0.86, 0.86, 0.84, 1.0)
-_FLOORS: Final[tuple[Rgba, ...]] = (
-    (0.80, 0.70, 0.56, 1.0),
-    (0.70, 0.76, 0.80, 1.0),
-    (0.78, 0.74, 0.66, 1.0),
-    (0.72, 0.78, 0.70, 1.0),
-    (0.80, 0.72, 0.72, 1.0),
-)
-_OPENS: Final[Rgba] = (0.80, 0.58, 0.34, 1.0)
-_WORKS: Final[Rgba] = (0.45, 0.60, 0.74, 1.0)
-_RESTS: Final[Rgba] = (0.60, 0.47, 0.38, 1.0)
-_SOFT: Final[Rgba] = (0.45, 0.50, 0.62, 1.0)
-_DOOR: Final[Rgba] = (0.55, 0.30, 0.18, 1.0)
-_GLASS: Final[Rgba] = (0.66, 0.84, 0.93, 1.0)
-_MIRROR: Final[Rgba] = (0.90, 0.96, 0.99, 1.0)
-_FRAME: Final[Rgba] = (0.30, 0.27, 0.25, 1.0)
-_LEAVES: Final[Rgba] = (0.42, 0.58, 0.36, 1.0)
-_PLANTS: Final = frozenset(
-    {"tree", "low_resolution_tree", "bush", "pot_plant", "hanging_plant", "greenery", "vine"}
-)
-_MIRRORS: Final = frozenset({"mirror", "standing_mirror"})
-_CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
 _PANEL_M: Final = 0.1
 _PANE_M: Final = 0.03
 """Thinner walls are door panels (first) and window panes (second)."""
+_AMBIENT: Final = 0.68
+_DIFFUSE: Final = 0.32
+"""Shares of a colour that surfaces show in flat pictures, away from the light and towards it."""
+_CEILING_M: Final = 0.02
+"""Height of a ceiling above the tops of its walls."""
 
 
 _CHASSIS: Final = (0.78, 0.16, 0.14, 1.0)
 _OWN_LINKS: Final = frozenset({"base", "stage", "carriage"})
+
+
+@dataclass(frozen=True, slots=True)
+class SeenPart:
+    """Part of a picture: its shape, its place in the world and its material."""
+
+    part: ConvexPart
+    pose: Pose
+    material: Material
+
+
+@dataclass(frozen=True)
+class Buffers:
+    """Buffers of Bullet's renderer: RGB values, depth values and body numbers, -1 for none; shape (height, width)."""
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    body: NDArray[np.int32]
 
 
 class VisualScene:
@@ -69,6 +71,14 @@ class VisualScene:
         self._bullet = connect(renders=True)
         self._shapes: dict[tuple[object, ...], int] = {}
         self._solids: dict[str, list[tuple[int, ConvexPart]]] = {}
+        self.parts: dict[int, SeenPart] = {}
+        """Part of each body but the robot's."""
+        self.owners: dict[int, str] = {}
+        """Name of the object that a body belongs to."""
+        self.walls: set[int] = set()
+        """Bodies of walls, without doors and panes."""
+        self.moves = 0
+        """Number of changes of the bodies' places so far."""
 
     def __enter__(self) -> VisualScene:
         return self
@@ -77,17 +87,26 @@ class VisualScene:
         self._bullet.disconnect()
 
     def add_floors(self) -> None:
-        """Add a slab for each room, in alternating colours."""
-        for number, room in enumerate(self.scene.rooms):
+        """Add a slab for each room, of the material of its type of room."""
+        for room in self.scene.rooms:
             size = (room.size_m[0] + 0.12, room.size_m[1] + 0.12, 0.04)
-            self.add_solid(Shape.BOX, size, Pose((*room.center_m, -0.02)), _FLOORS[number % len(_FLOORS)])
+            self._add_box(size, (*room.center_m, -0.02), floor_of(room.type))
+
+    def add_ceilings(self) -> None:
+        """Add a ceiling over each room but gardens. Seen from above, it is not there: the renderer shows only its underside."""
+        for room in self.scene.rooms:
+            if room.type != "garden":
+                self._add_ceiling(room.low_m, room.high_m, room.height_m + _CEILING_M)
 
     def add_walls(self, seen_as: Callable[[ConvexPart], ConvexPart | None]) -> None:
         """Add walls, and leaves of the doors between rooms, as ``seen_as`` returns them; None leaves one out."""
         for wall in (*self.scene.walls, *door_leaves(self.scene)):
             seen = seen_as(wall)
             if seen is not None:
-                self._add_part(seen, IDENTITY, _material(wall))
+                material = _material(wall)
+                body = self._add_part(seen, IDENTITY, material)
+                if material is WALL:
+                    self.walls.add(body)
 
     def add_objects(self, visible: Callable[[SceneObject], bool] = lambda item: True) -> None:
         """Add the objects at their initial places; absent ones are out of sight."""
@@ -95,12 +114,13 @@ class VisualScene:
             if not visible(item):
                 continue
             asset = self.scene.assets[item.asset_id]
-            colors = iter(part_colors(asset))
+            materials = iter(part_materials(asset))
             self._solids[item.name] = [
-                (self._add_part(part, OUT_OF_SIGHT, next(colors)), part)
+                (self._add_part(part, OUT_OF_SIGHT, next(materials)), part)
                 for link in asset.links
                 for part in link.parts
             ]
+            self.owners.update((body, item.name) for body, _ in self._solids[item.name])
             if not item.absent:
                 self.put(item.name, item.pose_world_asset, item.joints)
 
@@ -108,11 +128,10 @@ class VisualScene:
         """Add the background objects at their places."""
         for item in self.scene.background:
             asset = self.scene.assets[item.asset_id]
-            # Books of one category stand side by side: each model has its own colour.
-            color = _hue(zlib.crc32(item.asset_id.encode()) / 2**32) if is_small(asset) else _color_of(asset)
+            materials = iter(part_materials(asset))
             for link in asset.links:
                 for part in link.parts:
-                    self._add_part(part, item.pose_world_asset, color)
+                    self._add_part(part, item.pose_world_asset, next(materials))
 
     def put(self, name: str, pose: Pose, fractions: Sequence[float] = ()) -> None:
         """Show an object at a pose in the world, its joints at shares of their travel; unknown solids stay unseen."""
@@ -133,55 +152,79 @@ class VisualScene:
         """Add the robot, out of sight at first."""
         return RobotFigure(self._bullet)
 
-    def add_solid(
-        self, shape: Shape, size_m: Vec3, pose: Pose, color: Rgba, vertices_m: tuple[Vec3, ...] = ()
-    ) -> int:
-        """Add one visual body and return its id."""
-        key = (shape, size_m, vertices_m, color)
-        if key not in self._shapes:
-            self._shapes[key] = self._visual(shape, size_m, color, vertices_m)
-        body = self._bullet.createMultiBody(
-            0.0, -1, self._shapes[key], basePosition=pose.position_m, baseOrientation=pose.quat_xyzw
-        )
-        return int(body)
+    def shoot(self, view: View, width_px: int, height_px: int) -> NDArray[np.uint8]:
+        """Render a view: RGB values, shape (height, width, 3), flat colours without shadows."""
+        return np.ascontiguousarray(self.capture(view, width_px, height_px).color)
 
-    def shoot(
-        self, view: Sequence[float], lens: Sequence[float], width_px: int, height_px: int
-    ) -> NDArray[np.uint8]:
-        """Render through a view and a projection matrix: RGB values, shape (height, width, 3)."""
+    def capture(self, view: View, width_px: int, height_px: int) -> Buffers:
+        """Render the buffers of a view."""
         image = self._bullet.getCameraImage(
             width_px,
             height_px,
-            view,
-            lens,
+            view.view_matrix,
+            view.lens_matrix,
             shadow=0,
             lightDirection=(0.5, -0.8, 2.0),
+            lightAmbientCoeff=_AMBIENT,
+            lightDiffuseCoeff=_DIFFUSE,
             renderer=self._bullet.ER_TINY_RENDERER,
-            flags=self._bullet.ER_NO_SEGMENTATION_MASK,
         )
-        pixels = np.asarray(image[2], dtype=np.uint8).reshape(height_px, width_px, 4)
-        return np.ascontiguousarray(pixels[..., :3])
+        size = (height_px, width_px)
+        return Buffers(
+            np.asarray(image[2], np.uint8).reshape(*size, 4)[..., :3],
+            np.asarray(image[3], np.float32).reshape(size),
+            np.asarray(image[4], np.int32).reshape(size),
+        )
 
-    def look_at(self, eye: Sequence[float], target: Sequence[float]) -> list[float]:
-        """View matrix of a camera at ``eye`` that looks at ``target``, z up."""
-        return list(self._bullet.computeViewMatrix(list(eye), list(target), [0.0, 0.0, 1.0]))
+    def _add_box(self, size_m: Vec3, center_m: Vec3, material: Material) -> int:
+        return self._add_part(ConvexPart(Shape.BOX, IDENTITY, size_m), Pose(center_m), material)
 
-    def lens(self, field_of_view_deg: float, aspect: float, near_m: float, far_m: float) -> list[float]:
-        """Projection matrix of a perspective camera; the field of view is vertical."""
-        return list(self._bullet.computeProjectionMatrixFOV(field_of_view_deg, aspect, near_m, far_m))
+    def _add_ceiling(self, low_m: tuple[float, float], high_m: tuple[float, float], height_m: float) -> None:
+        (a, b), (c, d) = low_m, high_m
+        mesh = {
+            "vertices": [(a, b, height_m), (a, d, height_m), (c, d, height_m), (c, b, height_m)],
+            "indices": [0, 1, 2, 0, 2, 3],
+            "normals": [(0.0, 0.0, -1.0)] * 4,
+        }
+        look = {"rgbaColor": (*CEILING.color, 1.0), "specularColor": (0, 0, 0)}
+        shape = self._bullet.createVisualShape(self._bullet.GEOM_MESH, **mesh, **look)
+        body = int(self._bullet.createMultiBody(0.0, -1, shape))
+        size = (c - a, d - b, 0.002)
+        pose = Pose(((a + c) / 2, (b + d) / 2, height_m))
+        self.parts[body] = SeenPart(ConvexPart(Shape.BOX, IDENTITY, size), pose, CEILING)
 
-    def _add_part(self, part: ConvexPart, frame: Pose, color: Rgba) -> int:
-        return self.add_solid(part.shape, part.size_m, frame @ part.pose, color, part.vertices_m)
+    def _add_part(self, part: ConvexPart, frame: Pose, material: Material) -> int:
+        """Add one visual body and return its number."""
+        key = (part.shape, part.size_m, part.vertices_m, material.color)
+        if key not in self._shapes:
+            self._shapes[key] = self._visual(part.shape, part.size_m, (*material.color, 1.0), part.vertices_m)
+        pose = frame @ part.pose
+        body = int(
+            self._bullet.createMultiBody(
+                0.0, -1, self._shapes[key], basePosition=pose.position_m, baseOrientation=pose.quat_xyzw
+            )
+        )
+        self.parts[body] = SeenPart(part, pose, material)
+        self.moves += 1
+        return body
 
     def _place(self, body: int, pose: Pose) -> None:
         self._bullet.resetBasePositionAndOrientation(body, pose.position_m, pose.quat_xyzw)
+        self.parts[body] = replace(self.parts[body], pose=pose)
+        self.moves += 1
 
-    def _visual(self, shape: Shape, size_m: Vec3, color: Rgba, vertices_m: tuple[Vec3, ...]) -> int:
+    def _visual(
+        self,
+        shape: Shape,
+        size_m: Vec3,
+        color: tuple[float, float, float, float],
+        vertices_m: tuple[Vec3, ...],
+    ) -> int:
         bullet = self._bullet
         look = {"rgbaColor": color, "specularColor": (0, 0, 0)}
         match shape:
             case Shape.BOX:
-                half = tuple(max(extent, 0.002) / 2 for extent in size_m)
+                half = tuple(max(extent, THINNEST_M) / 2 for extent in size_m)
                 return int(bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=half, **look))
             case Shape.CYLINDER:
                 size = {"radius": size_m[0] / 2, "length": size_m[2]}
@@ -215,54 +258,12 @@ def _faces(points: FloatArray) -> dict[str, list[Any]]:
     }
 
 
-def _material(wall: ConvexPart) -> Rgba:
-    """Colour of a wall's part by its thickness."""
+def _material(wall: ConvexPart) -> Material:
+    """Material of a wall's part by its thickness."""
     thickness = min(wall.size_m[:2])
     if thickness < _PANE_M:
-        return _GLASS
-    return _DOOR if thickness < _PANEL_M else _WALL
-
-
-def part_colors(asset: Asset) -> list[Rgba]:
-    """Colours of the parts of all links: panels and drawers stand out from the body that they close, glass from its frame."""
-    if asset.category in _MIRRORS:
-        parts = [part for link in asset.links for part in link.parts]
-        glass = max(parts, key=lambda part: part.size_m[1] * part.size_m[2])
-        return [_MIRROR if part is glass else _FRAME for part in parts]
-    color = _color_of(asset)
-    return [
-        color if number == 0 else _lighter(color)
-        for number, link in enumerate(asset.links)
-        for _ in link.parts
-    ]
-
-
-def _color_of(asset: Asset) -> Rgba:
-    """Colour by function; small objects get a vivid colour from their category."""
-    if is_small(asset):
-        return _hue(zlib.crc32(asset.category.encode()) / 2**32)
-    if asset.category in _CLOTH:
-        return _SOFT
-    if asset.category in _PLANTS:
-        return _LEAVES
-    if asset.can("openable"):
-        return _OPENS
-    return _WORKS if asset.can("toggleable") or asset.can("heatSource") else _RESTS
-
-
-def is_small(asset: Asset) -> bool:
-    """Return True for a small object, which gets a vivid colour."""
-    return max(asset.size_m) < 0.6 and asset.mass_kg <= ROBOT.mass_kg
-
-
-def _hue(share: float) -> Rgba:
-    red, green, blue = (0.5 + 0.4 * math.cos(2 * math.pi * (share + shift)) for shift in (0.0, 1 / 3, 2 / 3))
-    return (red, green, blue, 1.0)
-
-
-def _lighter(color: Rgba) -> Rgba:
-    red, green, blue = (channel + 0.3 * (1.0 - channel) for channel in color[:3])
-    return (red, green, blue, 1.0)
+        return PANE
+    return DOOR_PANEL if thickness < _PANEL_M else WALL
 
 
 class RobotFigure:

@@ -4,12 +4,12 @@ import io
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from PIL import Image
 from rich.console import Console
@@ -22,14 +22,20 @@ from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.pictures.relations import draw_relations
 from embomatrix.factory.pictures.scene import draw_plan
-from embomatrix.factory.pictures.sheet import draw_eyes, draw_sheet, draw_views
+from embomatrix.factory.pictures.sheet import (
+    draw_eyes,
+    draw_oblique,
+    draw_sheet,
+    draw_tagged_eyes,
+    draw_tagged_oblique,
+    draw_views,
+)
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene, build_house
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.host.commands import command_group
 from embomatrix.host.limits import usable_cores
-from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import write_whole
@@ -44,6 +50,22 @@ class Drawing(StrEnum):
     SHEET = "sheet"
     VIEWS = "views"
     RELATIONS = "relations"
+
+
+class PictureFormat(StrEnum):
+    """Formats of rendered pictures; the value is the suffix of the file."""
+
+    PNG = "png"
+    JPEG = "jpg"
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePicture:
+    """Picture with the name of its file without suffix; a ``rendered`` one has soft shades, any other lines and text."""
+
+    title: str
+    image: Image.Image
+    rendered: bool = False
 
 
 SceneIds = Annotated[
@@ -76,6 +98,18 @@ Kind = Annotated[
         "by side; or examples and counterexamples of every relation, without scenes.",
     ),
 ]
+LabelsOption = Annotated[
+    bool,
+    typer.Option(
+        "--labels", help="Write the names of visible objects into the oblique view and the robot's view."
+    ),
+]
+FormatOption = Annotated[
+    PictureFormat,
+    typer.Option(
+        "--format", help="Format of rendered pictures; JPEG files are smaller. Plans are PNG files."
+    ),
+]
 Jobs = Annotated[int, typer.Option(min=1, help="Number of processes.")]
 Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and objects left out.")
@@ -84,6 +118,9 @@ Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets tha
 Background = Annotated[
     bool, typer.Option(help="Fill homes with background objects, as many as real rooms hold.")
 ]
+JPEG_QUALITY = 85
+VIEW_PX = (1280, 960)
+"""Size of the oblique view of a scene."""
 CORES = usable_cores()
 _user_errors = partial(user_errors, more=(FloorPlanError, HouseFileError, ModelFileError, SceneFileError))
 LEFT_OUT = "for objects that were left out, and why: `embomatrix scene show NAME`, or --report FILE"
@@ -192,8 +229,15 @@ def draw(
     kind: Kind = Drawing.SCENE,
     seed: Seed = 0,
     out: Out = Path(),
+    labels: LabelsOption = False,
+    file_format: FormatOption = PictureFormat.PNG,
 ) -> None:
     """Draw scenes or examples of the relations as PNG files in a folder."""
+    if labels and kind is not Drawing.SCENE:
+        fail(
+            f"found --labels with --as {kind}: names are written into the oblique view and the robot's view of single "
+            f"scenes; leave out --labels, or leave out --as"
+        )
     names = () if kind is Drawing.RELATIONS else _chosen(scenes, every)
     with _user_errors(out):
         for name in names:
@@ -201,28 +245,45 @@ def draw(
         out.mkdir(parents=True, exist_ok=True)
         with progress() as bars:
             built = [_built(name, seed) for name in bars.track(names, description="scenes")]
-        for title, picture in _pictures(kind, built):
-            buffer = io.BytesIO()
-            picture.save(buffer, format="PNG", optimize=True)
-            file = out / f"{title}.png"
-            write_whole(file, buffer.getvalue())
-            say(file)
+        for picture in _tagged_pictures(built) if labels else _pictures(kind, built):
+            say(_written(picture, out, file_format))
 
 
-def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
-    """Yield pictures of a kind with their titles. Raise EngineError without pybullet."""
+def _written(picture: ScenePicture, out: Path, file_format: PictureFormat) -> Path:
+    """Write a picture into a folder and return its path."""
+    used = file_format if picture.rendered else PictureFormat.PNG
+    buffer = io.BytesIO()
+    if used is PictureFormat.PNG:
+        picture.image.save(buffer, format="PNG", optimize=True)
+    else:
+        picture.image.save(buffer, format="JPEG", optimize=True, quality=JPEG_QUALITY)
+    file = out / f"{picture.title}.{used}"
+    write_whole(file, buffer.getvalue())
+    return file
+
+
+def _tagged_pictures(scenes: Sequence[Scene]) -> Iterator[ScenePicture]:
+    """Yield the pictures of each scene, with names in all of them. Raise EngineError without pybullet."""
+    for scene in scenes:
+        yield ScenePicture(f"{scene.scene_id}_plan", draw_plan(scene))
+        yield ScenePicture(f"{scene.scene_id}_view", draw_tagged_oblique(scene, VIEW_PX), rendered=True)
+        yield ScenePicture(f"{scene.scene_id}_eyes", draw_tagged_eyes(scene), rendered=True)
+
+
+def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[ScenePicture]:
+    """Yield pictures of a kind. Raise EngineError without pybullet."""
     match kind:
         case Drawing.SCENE:
             for scene in scenes:
-                yield f"{scene.scene_id}_plan", draw_plan(scene)
-                yield f"{scene.scene_id}_view", Image.fromarray(np.asarray(render_oblique(scene)))
-                yield f"{scene.scene_id}_eyes", draw_eyes(scene)
+                yield ScenePicture(f"{scene.scene_id}_plan", draw_plan(scene))
+                yield ScenePicture(f"{scene.scene_id}_view", draw_oblique(scene, VIEW_PX), rendered=True)
+                yield ScenePicture(f"{scene.scene_id}_eyes", draw_eyes(scene), rendered=True)
         case Drawing.SHEET:
-            yield "sheet", draw_sheet(scenes).quantize(64)
+            yield ScenePicture("sheet", draw_sheet(scenes).quantize(64))
         case Drawing.VIEWS:
-            yield "views", draw_views(scenes).quantize(128)
+            yield ScenePicture("views", draw_views(scenes), rendered=True)
         case Drawing.RELATIONS:
-            yield "relations", draw_relations().quantize(64)
+            yield ScenePicture("relations", draw_relations(), rendered=True)
 
 
 def _run(orders: Sequence[SceneBuildJob], jobs: int) -> list[SceneReport]:

@@ -11,8 +11,10 @@ from PIL import Image, ImageDraw, ImageFont
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.pictures.sheet import in_rows
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.photograph import Photographer
 from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.geometry.bounds import AssetBounds
+from embomatrix.sim.looks.view import View
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Asset
 from embomatrix.world.catalog import Catalog
@@ -197,5 +199,6 @@ def _photographed(
     span = max(LEAST_SPAN_M, *box.size_m)
     x, y, z = box.center_m
     eye = (x + 2.6 * span, y + panel.side * span, z + panel.above * span)
-    lens = stage.lens(32.0, PANEL_PX[0] / PANEL_PX[1], 0.05, 50.0)
-    return stage.shoot(stage.look_at(eye, (x, y, z)), lens, *PANEL_PX)
+    view = View.toward(eye, (x, y, z), 32.0, PANEL_PX[0] / PANEL_PX[1], 0.05, 50.0)
+    lit = Aabb((x - span, y - span, z - span), (x + span, y + span, z + span))
+    return Photographer(stage).shoot(view, lit, *PANEL_PX).pixels

@@ -4,11 +4,12 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from embomatrix.factory.pictures.scene import draw_thumbnail
-from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
+from embomatrix.factory.pictures.tags import tagged
+from embomatrix.sim.bullet.camera import photograph_around, photograph_oblique, render_oblique
+from embomatrix.sim.bullet.photograph import Photo
 from embomatrix.world.scene import Scene
 
 _CAPTION_PX: Final = 16
@@ -40,13 +41,15 @@ def draw_sheet(scenes: Sequence[Scene], *, columns: int = 9, cell_px: int = 200)
 
 
 def draw_oblique(scene: Scene, size_px: tuple[int, int]) -> Image.Image:
-    """Return an oblique view. It is rendered at twice the size, since Bullet's renderer does no antialiasing.
-
-    Raises EngineError without pybullet.
-    """
+    """Return an oblique view. Raises EngineError without pybullet."""
     width, height = size_px
-    view = render_oblique(scene, width_px=2 * width, height_px=2 * height)
-    return Image.fromarray(np.asarray(view)).resize(size_px, Image.Resampling.LANCZOS)
+    return Image.fromarray(render_oblique(scene, width_px=width, height_px=height))
+
+
+def draw_tagged_oblique(scene: Scene, size_px: tuple[int, int]) -> Image.Image:
+    """Return an oblique view with the names of the visible objects. Raises EngineError without pybullet."""
+    width, height = size_px
+    return _tagged(photograph_oblique(scene, width_px=width, height_px=height))
 
 
 def draw_views(scenes: Sequence[Scene], *, width_px: int = 560) -> Image.Image:
@@ -60,6 +63,19 @@ def draw_eyes(scene: Scene, *, width_px: int = 480) -> Image.Image:
 
     Raises EngineError without pybullet.
     """
-    views = render_egocentric(scene, width_px=width_px, height_px=width_px * 3 // 4)
-    named = [(Image.fromarray(view), words) for words, view in zip(_DIRECTIONS, views, strict=True)]
-    return in_rows(named, 2, caption_px=_CAPTION_PX, font_px=12)
+    photos = photograph_around(scene, width_px=width_px, height_px=width_px * 3 // 4)
+    return _around([Image.fromarray(photo.pixels) for photo in photos])
+
+
+def draw_tagged_eyes(scene: Scene, *, width_px: int = 640) -> Image.Image:
+    """Return the robot's view as `draw_eyes` does, with the names of the visible objects."""
+    photos = photograph_around(scene, width_px=width_px, height_px=width_px * 3 // 4)
+    return _around([_tagged(photo) for photo in photos])
+
+
+def _around(pictures: Sequence[Image.Image]) -> Image.Image:
+    return in_rows([*zip(pictures, _DIRECTIONS, strict=True)], 2, caption_px=_CAPTION_PX, font_px=12)
+
+
+def _tagged(photo: Photo) -> Image.Image:
+    return tagged(Image.fromarray(photo.pixels), photo.seen)
