@@ -207,7 +207,19 @@ COMMANDS = (
     ),
     CommandCase("negative minutes", "train --minutes=-1", "--minutes", "greater than or equal to 0"),
     CommandCase("option without number", "train --steps=many", "--steps", "valid integer"),
-    CommandCase("missing argument", "factory export", "'folder'", "Try 'embomatrix factory export --help'"),
+    CommandCase(
+        "dataset without its option",
+        "factory verify KITCHEN --jobs=1",
+        "KITCHEN",
+        "give the dataset as --dataset",
+    ),
+    CommandCase(
+        "dataset of the shipped sample of traffic",
+        "bench traffic --dataset=KITCHEN",
+        "--dataset",
+        "give both, or neither",
+    ),
+    CommandCase("missing option", "factory export", "'--out'", "Try 'embomatrix factory export --help'"),
     CommandCase(
         "model without endpoint",
         "factory agent scene-extractor --in=FILES/brief.json --llm=http://localhost:1/v1",
@@ -222,7 +234,7 @@ COMMANDS = (
     ),
     CommandCase(
         "export to unknown type",
-        "factory export KITCHEN --out=FILES/tasks.xlsx",
+        "factory export --dataset=KITCHEN --out=FILES/tasks.xlsx",
         ".xlsx",
         "expected .jsonl or .parquet",
     ),
@@ -632,7 +644,10 @@ COMMANDS = (
         "run `embomatrix eai install`",
     ),
     CommandCase(
-        "damaged GGUF file", "model import-gguf FILES/model.gguf FILES/new", "model.gguf", "pass another file"
+        "damaged GGUF file",
+        "model import-gguf FILES/model.gguf FILES/new_model",
+        "model.gguf",
+        "pass another file",
     ),
     # Manager
     CommandCase("port out of range", "manager serve --port=99999", "99999", "less than or equal to 65535"),
@@ -777,7 +792,7 @@ COMMANDS = (
     ),
     CommandCase(
         "pyarrow is not installed",
-        "factory export KITCHEN --out=FILES/tasks.parquet",
+        "factory export --dataset=KITCHEN --out=FILES/tasks.parquet",
         "pyarrow",
         "pip install 'embomatrix[export]'",
         hidden_package="pyarrow",
