@@ -85,12 +85,12 @@ wheel: $(VENV)/.dev
 	$(BIN)/python -m build --no-isolation --outdir build/dist
 
 pictures: $(VENV)/.dev
-	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --out docs/pictures
-	$(BIN)/embomatrix scene draw docs/examples/two_bedroom_flat.toml --out build/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --out docs/pictures --force
+	$(BIN)/embomatrix scene draw docs/examples/two_bedroom_flat.toml --out build/pictures --force
 	cp build/pictures/two_bedroom_flat_plan.png docs/pictures/
-	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --out docs/pictures
-	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures
-	$(BIN)/embomatrix scene draw --as relations --out docs/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --out docs/pictures --force
+	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures --force
+	$(BIN)/embomatrix scene draw --as relations --out docs/pictures --force
 
 clean:
 	rm -rf build runs

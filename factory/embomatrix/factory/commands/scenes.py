@@ -1,6 +1,5 @@
 """``embomatrix scene``: build, list, show, draw and check base scenes."""
 
-import io
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -20,15 +19,17 @@ from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
 from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
+from embomatrix.factory.pictures.png import write_png
 from embomatrix.factory.pictures.relations import draw_relations
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import draw_eyes, draw_sheet, draw_views
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene, build_house
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
-from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
+from embomatrix.factory.scenes.scene_file import SCENE_MARKS, SUFFIX, SceneFileError, read_scene
 from embomatrix.host.commands import command_group
 from embomatrix.host.limits import usable_cores
+from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
@@ -107,6 +108,7 @@ def build(
     jobs: Jobs = CORES,
     assets: Assets = None,
     background: Background = True,
+    force: Force = False,
 ) -> None:
     """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 if one has a problem."""
     chosen = _chosen(scene_ids, every)
@@ -131,6 +133,7 @@ def build(
         for name, house in houses.items()
         for seed in dict.fromkeys(seeds or (0,))
     ]
+    keep_foreign("", [order.path for order in orders if order.path is not None], *SCENE_MARKS, force=force)
     reports = _run(orders, jobs)
     say(orders[0].path if len(orders) == 1 else out)
     for done in reports:
@@ -192,6 +195,7 @@ def draw(
     kind: Kind = Drawing.SCENE,
     seed: Seed = 0,
     out: Out = Path(),
+    force: Force = False,
 ) -> None:
     """Draw scenes or examples of the relations as PNG files in a folder."""
     names = () if kind is Drawing.RELATIONS else _chosen(scenes, every)
@@ -201,12 +205,19 @@ def draw(
         out.mkdir(parents=True, exist_ok=True)
         with progress() as bars:
             built = [_built(name, seed) for name in bars.track(names, description="scenes")]
+        files = {title: out / f"{title}.png" for title in _titles(kind, built)}
+        keep_foreign("", files.values(), PICTURE_MARK, force=force)
         for title, picture in _pictures(kind, built):
-            buffer = io.BytesIO()
-            picture.save(buffer, format="PNG", optimize=True)
-            file = out / f"{title}.png"
-            write_whole(file, buffer.getvalue())
+            file = files[title]
+            write_png(file, picture)
             say(file)
+
+
+def _titles(kind: Drawing, scenes: Sequence[Scene]) -> list[str]:
+    """Return the titles of all pictures of a kind."""
+    if kind is not Drawing.SCENE:
+        return [kind.value]
+    return [f"{scene.scene_id}_{view}" for scene in scenes for view in ("plan", "view", "eyes")]
 
 
 def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:

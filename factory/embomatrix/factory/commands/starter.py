@@ -11,8 +11,9 @@ from embomatrix.factory.commands.options import Jobs
 from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.days.maker import DAYS
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
-from embomatrix.starter.archive import RECIPE, content_digest, pack, unpack
-from embomatrix.world.dataset import Dataset, write_dataset
+from embomatrix.host.own_files import Force
+from embomatrix.starter.archive import RECIPE, content_digest, is_shipped, pack, unpack
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
 
 
 def starter(
@@ -29,10 +30,13 @@ def starter(
         typer.Option(help="Build the dataset by its recipe, resumably, and pack it into this file."),
     ] = None,
     jobs: Jobs = None,
+    force: Force = False,
 ) -> None:
     """Unpack the dataset that ships with the package. With --check or --packed, build it by its recipe; takes an hour."""
     with user_errors(out):
         if not check and packed is None:
+            if not force:
+                _check_replaceable(out)
             digest = unpack(out)
             dataset = Dataset.load(out)
             say(f"{len(dataset.train)} training and {len(dataset.heldout)} held-out tasks in {out}: {digest}")
@@ -47,6 +51,20 @@ def starter(
                     f"the recipe gives {digest}, and the shipped dataset is {shipped}: this version builds other tasks"
                 )
             say("the shipped dataset is what its recipe gives")
+
+
+def _check_replaceable(out: Path) -> None:
+    """Exit if the folder holds a dataset other than the shipped one."""
+    if not (out / TASKS_FILE).exists():
+        return
+    try:
+        replaceable = is_shipped(Dataset.load(out))
+    except DatasetError:
+        replaceable = False
+    if not replaceable:
+        fail(
+            f"{out} holds another dataset than the shipped one: name another folder with --out, or pass --force to replace it"
+        )
 
 
 def _comparable(folder: Path) -> str:
