@@ -142,6 +142,8 @@ def write_files(folder: Path, kitchen: Path) -> None:
         (folder / name).write_text(text, encoding="utf-8")
     (folder / "binary.bddl").write_bytes(b"\xff\xfe\x00")
     (folder / "empty").mkdir()
+    (folder / "units").mkdir()
+    (folder / "units" / "embomatrix-worker.service").write_text("[Unit]\n", encoding="utf-8")
     (folder / "run" / "checkpoints" / "step-000001").mkdir(parents=True)
     (folder / "cut_checkpoint").mkdir()
     (folder / "cut_checkpoint" / "state.json").write_text("{", encoding="utf-8")
@@ -255,6 +257,46 @@ COMMANDS = (
         "train --reward=goal=-3 --dataset=KITCHEN --out=FILES/new",
         "goal",
         "expected 0 or more",
+    ),
+    # Files of others
+    CommandCase(
+        "another dataset in the place of the shipped one",
+        "factory starter --out=KITCHEN",
+        "KITCHEN",
+        "name another folder with --out, or pass --force",
+    ),
+    CommandCase(
+        "build into another dataset",
+        "factory build --scene=Rs_int --train=1 --heldout=0 --out=KITCHEN",
+        "KITCHEN",
+        "name another folder with --out",
+    ),
+    CommandCase(
+        "selection over its own dataset",
+        "factory difficulty --dataset=KITCHEN --out=KITCHEN --easy-share=0.5",
+        "KITCHEN",
+        "name another folder with --out",
+    ),
+    CommandCase(
+        "evaluation beside a foreign report",
+        "eval --baseline=random --dataset=KITCHEN --out=FILES",
+        "FILES/report.json",
+        "pass another --out",
+    ),
+    CommandCase(
+        "unit of others",
+        "worker install --folder=FILES/units",
+        "FILES/units/embomatrix-worker.service",
+        "pass --force",
+    ),
+    CommandCase(
+        "judge into a folder of others", "eai install --folder=FILES", "FILES", "name another folder"
+    ),
+    CommandCase(
+        "model into a folder of others",
+        "model import-gguf FILES/model.gguf FILES",
+        "FILES",
+        "give a new folder",
     ),
     # Datasets
     CommandCase(

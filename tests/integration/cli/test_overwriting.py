@@ -40,6 +40,8 @@ class Refusal:
 TASKS = "OUT/tasks.jsonl"
 REFUSALS = (
     Refusal("factory starter --out OUT", TASKS),
+    Refusal("factory starter --check --out OUT", TASKS),
+    Refusal("factory starter --check --out OUT", "OUT/shipped/tasks.jsonl"),
     Refusal("factory build --out OUT --train 1 --heldout 0 --scene Rs_int", TASKS),
     Refusal("factory generate --out OUT --tasks 1 --scene Rs_int", TASKS),
     Refusal("factory import --bddl one.bddl --scene Rs_int --out OUT", TASKS),

@@ -11,6 +11,7 @@ from embomatrix.factory.commands.options import Jobs
 from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.days.maker import DAYS
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.factory.pipeline.store import BUILD_FILE
 from embomatrix.host.own_files import Force
 from embomatrix.starter.archive import RECIPE, content_digest, is_shipped, pack, unpack
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
@@ -41,7 +42,9 @@ def starter(
             dataset = Dataset.load(out)
             say(f"{len(dataset.train)} training and {len(dataset.heldout)} held-out tasks in {out}: {digest}")
             return
-        shipped = _comparable(out / "shipped") if check else ""
+        if (out / TASKS_FILE).exists() and not (out / BUILD_FILE).exists():
+            fail(f"{out} holds a dataset that no build wrote: name another folder with --out")
+        shipped = _comparable(out / "shipped", force=force) if check else ""
         found = _built(out, jobs)
         digest = content_digest(found) if packed is None else pack(found, packed)
         say(f"{len(found.records)} tasks in {out}: {digest}")
@@ -67,8 +70,10 @@ def _check_replaceable(out: Path) -> None:
         )
 
 
-def _comparable(folder: Path) -> str:
+def _comparable(folder: Path, *, force: bool) -> str:
     """Unpack the shipped dataset and return its digest. Exit at once if its size already differs from the recipe's."""
+    if not force:
+        _check_replaceable(folder)
     digest = unpack(folder)
     shipped = Dataset.load(folder)
     found = (len(shipped.train), len(shipped.heldout))
