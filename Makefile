@@ -85,12 +85,12 @@ wheel: $(VENV)/.dev
 	$(BIN)/python -m build --no-isolation --outdir build/dist
 
 pictures: $(VENV)/.dev
-	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --format jpg --out docs/pictures
-	$(BIN)/embomatrix scene draw docs/examples/two_bedroom_flat.toml --out build/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --format jpg --out docs/pictures --force
+	$(BIN)/embomatrix scene draw docs/examples/two_bedroom_flat.toml --out build/pictures --force
 	cp build/pictures/two_bedroom_flat_plan.png docs/pictures/
-	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --format jpg --out docs/pictures
-	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures
-	$(BIN)/embomatrix scene draw --as relations --format jpg --out docs/pictures
+	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --as views --format jpg --out docs/pictures --force
+	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures --force
+	$(BIN)/embomatrix scene draw --as relations --format jpg --out docs/pictures --force
 	$(BIN)/embomatrix play Rs_int-train-000-03 --oracle --mode physical --film docs/pictures/physical.gif
 
 clean:

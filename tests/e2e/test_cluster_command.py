@@ -106,6 +106,23 @@ async def test_unknown_run_or_worker_error_names_the_remedy(tmp_path):
         assert (written.status, "can't be written" in written.text) == (2, True)
 
 
+async def test_report_and_trace_without_a_file_name_replace_only_their_own_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    async with manager(tmp_path / "data") as at, open_run(at.address):
+        there = f"--manager={at.address}"
+        for command, name in (("report", "r1.html"), ("trace", "r1.trace.json")):
+            file = tmp_path / name
+            file.write_text("mine")
+            refused = await cluster_command(command, "r1", there)
+            assert (refused.status, f"{name} was not written by this command" in refused.text) == (2, True)
+            assert file.read_text() == "mine"
+            assert (await cluster_command(command, "r1", there, "--force")).status == 0
+            assert (await cluster_command(command, "r1", there)).status == 0
+            file.write_text("mine")
+            assert (await cluster_command(command, "r1", there, f"--out={file}")).status == 0
+            assert file.read_text() != "mine", "a named file is replaced"
+
+
 async def test_reports_are_found_by_name_and_an_ambiguous_name_lists_the_ids(tmp_path):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         there = f"--manager={at.address}"

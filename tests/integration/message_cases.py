@@ -142,6 +142,8 @@ def write_files(folder: Path, kitchen: Path) -> None:
         (folder / name).write_text(text, encoding="utf-8")
     (folder / "binary.bddl").write_bytes(b"\xff\xfe\x00")
     (folder / "empty").mkdir()
+    (folder / "units").mkdir()
+    (folder / "units" / "embomatrix-worker.service").write_text("[Unit]\n", encoding="utf-8")
     (folder / "run" / "checkpoints" / "step-000001").mkdir(parents=True)
     (folder / "cut_checkpoint").mkdir()
     (folder / "cut_checkpoint" / "state.json").write_text("{", encoding="utf-8")
@@ -213,7 +215,19 @@ COMMANDS = (
     ),
     CommandCase("negative minutes", "train --minutes=-1", "--minutes", "greater than or equal to 0"),
     CommandCase("option without number", "train --steps=many", "--steps", "valid integer"),
-    CommandCase("missing argument", "factory export", "'folder'", "Try 'embomatrix factory export --help'"),
+    CommandCase(
+        "dataset without its option",
+        "factory verify KITCHEN --jobs=1",
+        "KITCHEN",
+        "give the dataset as --dataset",
+    ),
+    CommandCase(
+        "dataset of the shipped sample of traffic",
+        "bench traffic --dataset=KITCHEN",
+        "--dataset",
+        "give both, or neither",
+    ),
+    CommandCase("missing option", "factory export", "'--out'", "Try 'embomatrix factory export --help'"),
     CommandCase(
         "model without endpoint",
         "factory agent scene-extractor --in=FILES/brief.json --llm=http://localhost:1/v1",
@@ -228,7 +242,7 @@ COMMANDS = (
     ),
     CommandCase(
         "export to unknown type",
-        "factory export KITCHEN --out=FILES/tasks.xlsx",
+        "factory export --dataset=KITCHEN --out=FILES/tasks.xlsx",
         ".xlsx",
         "expected .jsonl or .parquet",
     ),
@@ -249,6 +263,46 @@ COMMANDS = (
         "train --reward=goal=-3 --dataset=KITCHEN --out=FILES/new",
         "goal",
         "expected 0 or more",
+    ),
+    # Files of others
+    CommandCase(
+        "another dataset in the place of the shipped one",
+        "factory starter --out=KITCHEN",
+        "KITCHEN",
+        "name another folder with --out, or pass --force",
+    ),
+    CommandCase(
+        "build into another dataset",
+        "factory build --scene=Rs_int --train=1 --heldout=0 --out=KITCHEN",
+        "KITCHEN",
+        "name another folder with --out",
+    ),
+    CommandCase(
+        "selection over its own dataset",
+        "factory difficulty --dataset=KITCHEN --out=KITCHEN --easy-share=0.5",
+        "KITCHEN",
+        "name another folder with --out",
+    ),
+    CommandCase(
+        "evaluation beside a foreign report",
+        "eval --baseline=random --dataset=KITCHEN --out=FILES",
+        "FILES/report.json",
+        "pass another --out",
+    ),
+    CommandCase(
+        "unit of others",
+        "worker install --folder=FILES/units",
+        "FILES/units/embomatrix-worker.service",
+        "pass --force",
+    ),
+    CommandCase(
+        "judge into a folder of others", "eai install --folder=FILES", "FILES", "name another folder"
+    ),
+    CommandCase(
+        "model into a folder of others",
+        "model import-gguf FILES/model.gguf FILES",
+        "FILES",
+        "give a new folder",
     ),
     # Datasets
     CommandCase(
@@ -638,7 +692,10 @@ COMMANDS = (
         "run `embomatrix eai install`",
     ),
     CommandCase(
-        "damaged GGUF file", "model import-gguf FILES/model.gguf FILES/new", "model.gguf", "pass another file"
+        "damaged GGUF file",
+        "model import-gguf FILES/model.gguf FILES/new_model",
+        "model.gguf",
+        "pass another file",
     ),
     # Manager
     CommandCase("port out of range", "manager serve --port=99999", "99999", "less than or equal to 65535"),
@@ -783,7 +840,7 @@ COMMANDS = (
     ),
     CommandCase(
         "pyarrow is not installed",
-        "factory export KITCHEN --out=FILES/tasks.parquet",
+        "factory export --dataset=KITCHEN --out=FILES/tasks.parquet",
         "pyarrow",
         "pip install 'embomatrix[export]'",
         hidden_package="pyarrow",

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -15,12 +15,13 @@ from embomatrix.bench.cluster.flow import FlowSizes, bench_flow
 from embomatrix.bench.cluster.prewarm import PrewarmSizes, bench_prewarm
 from embomatrix.bench.engine.engine import bench_engine
 from embomatrix.bench.engine.plan_writer import save_workload, write_workload
-from embomatrix.bench.engine.workload import PINNED, SIZES, Workload, load_workload
+from embomatrix.bench.engine.workload import PINNED, SIZES, WORKLOAD_FILE, Workload, load_workload
 from embomatrix.bench.fidelity.page import figures_of
 from embomatrix.bench.fidelity.pool import Modes
 from embomatrix.bench.fidelity.suite import DISAGREEMENTS_FILE, RESULTS_FILE, FidelitySettings, run_fidelity
 from embomatrix.bench.peers.contest import PeerSizes, bench_peers
 from embomatrix.bench.report.figures import (
+    RESULT_MARK,
     BenchResult,
     describe_machine,
     merge_parts,
@@ -30,10 +31,12 @@ from embomatrix.bench.report.output import console, errors, hand_in, refusals, w
 from embomatrix.bench.report.page import check_page, render_page
 from embomatrix.host.code_version import commit_here
 from embomatrix.host.commands import command_group
+from embomatrix.host.own_files import Force, keep_foreign
 from embomatrix.pages.figures import Figure
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
-from embomatrix.world.dataset import Dataset
+from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET, DatasetFolder, default_dataset
+from embomatrix.world.dataset import TASKS_FILE, Dataset
 
 OnStep = Callable[[str], None]
 
@@ -49,7 +52,10 @@ class ClusterPart(StrEnum):
     PEERS = "peers"
 
 
-PINNED_HELP = "Dataset with a workload; by default the small one that the package ships."
+PINNED_HELP = (
+    "Folder of a dataset with the plans of `bench workload`. Default: the small one that the package ships, so that "
+    "figures can be compared."
+)
 DataSet = Annotated[Path, typer.Option("--dataset", help=PINNED_HELP, show_default=False)]
 Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
 PageFile = Annotated[Path, typer.Option(help="Page to update; text between its tables is kept.")]
@@ -62,6 +68,8 @@ Parts = Annotated[
 ]
 Naive = Annotated[int, typer.Option(min=1, help="Rollouts of the ablation's first row; each takes seconds.")]
 PAGE = Path("docs/benchmarks.md")
+ALL: Final = ("engine", "cluster")
+"""Benchmarks of `bench all`."""
 FULL_SUITE = Path("build/scenes")
 MODES = Modes(cached=load_simulator, physical=physical_simulator)
 QUICK = FidelitySettings(plans=24, calls=0, seed=0)
@@ -222,7 +230,13 @@ def traffic(
             help="Traffic of your own run: a file of `embomatrix train --record`. [default: a shipped sample]"
         ),
     ] = None,
-    dataset: Annotated[Path | None, typer.Option(help="Dataset of that run.")] = None,
+    dataset: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"Folder of that run's dataset. Default: ${DATASET_VARIABLE}, or {DEFAULT_DATASET}.",
+            show_default=False,
+        ),
+    ] = None,
     json_file: Json = None,
     rounds: Annotated[int, typer.Option(min=1, help="Replays of each phase.")] = 3,
 ) -> None:
@@ -237,10 +251,14 @@ def traffic(
         marks = bench_marks(pinned)
         return (*bench_traffic(found, sizes, on_step), *marks, *bench_turns(pinned, TurnSizes(), on_step))
 
-    if (record is None) != (dataset is None):
-        raise typer.BadParameter("--record and --dataset belong together: expected both or none")
+    if record is None and dataset is not None:
+        raise typer.BadParameter(
+            "--dataset is the dataset of a --record: give both, or neither for the shipped sample"
+        )
     with refusals():
-        found = sampled_traffic() if record is None or dataset is None else recorded_traffic(record, dataset)
+        found = (
+            sampled_traffic() if record is None else recorded_traffic(record, dataset or default_dataset())
+        )
         pinned, sizes = load_workload(PINNED), TrafficSizes(rounds=rounds)
         hand_in(_measured("traffic", measure), json_file)
 
@@ -248,14 +266,16 @@ def traffic(
 @app.command()
 def sample(
     record: Annotated[Path, typer.Option(help="File of `embomatrix train --record`.")],
-    dataset: Annotated[Path, typer.Option(help="Dataset of that run.")],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    dataset: DatasetFolder = DEFAULT_DATASET,
     scenes: Annotated[int, typer.Option(min=1, help="Scenes of the sample.")] = 18,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds and records give equal samples.")] = 0,
+    force: Force = False,
 ) -> None:
     """Write a sample of a training run's traffic, as the package ships one for `bench traffic`."""
-    from embomatrix.bench.traffic.recording import save_sample
+    from embomatrix.bench.traffic.recording import GROUPS_FILE, SCENES_FILE, save_sample
 
+    keep_foreign("bench", [out / GROUPS_FILE, out / SCENES_FILE], force=force)
     with refusals():
         found = save_sample(record, dataset, out, scenes, seed)
     groups = f"{len(found.early)} early and {len(found.late)} late groups"
@@ -289,7 +309,9 @@ def adversary(
 def fidelity(
     dataset: Annotated[
         Path | None,
-        typer.Option(help=f"Dataset. [default: {FULL_SUITE}; with --quick the one that the package ships]"),
+        typer.Option(
+            help=f"Folder of the dataset. Default: {FULL_SUITE}; with --quick the one that the package ships."
+        ),
     ] = None,
     json_file: Json = None,
     out: Annotated[
@@ -315,9 +337,7 @@ def fidelity(
 
 @app.command()
 def workload(
-    dataset: Annotated[
-        Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter`.")
-    ],
+    dataset: DatasetFolder = DEFAULT_DATASET,
     out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: the dataset's]")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds and datasets give equal files.")] = 0,
     bodies: Annotated[
@@ -325,10 +345,13 @@ def workload(
     ] = 300,
     scenes: Annotated[int, typer.Option(min=1, help="Scenes of the main size.")] = 4,
     plans: Annotated[int, typer.Option(min=1, help="Plans for each scene, all different.")] = 50,
+    force: Force = False,
 ) -> None:
     """Write the plans that benchmarks execute in a dataset's scenes."""
     if bodies not in SIZES:
         raise typer.BadParameter(f"found {bodies}: expected one of {', '.join(map(str, SIZES))}")
+    if out is not None and out.resolve() != dataset.resolve():
+        keep_foreign("bench", [out / TASKS_FILE, out / WORKLOAD_FILE], force=force)
     with refusals(), errors.status("reading the dataset") as status:
         found = Dataset.load(dataset)
 
@@ -352,11 +375,14 @@ def everything(
     part: Parts = None,
     naive: Naive = 16,
     cycles: Cycles = 2000,
+    force: Force = False,
 ) -> None:
     """Measure engine and cluster, and render the page."""
     with refusals():
         # A page that can't be updated is refused before minutes are spent.
         check_page(_text_of(out))
+        if json_dir is not None:
+            keep_foreign("bench", [json_dir / f"{name}.json" for name in ALL], RESULT_MARK, force=force)
         found = load_workload(dataset)
         results = [_engine(found, cycles), _cluster(found, part, naive, limit_s)]
         for result in results:

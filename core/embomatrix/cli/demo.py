@@ -14,6 +14,7 @@ from rich.logging import RichHandler
 from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, run_command
 from embomatrix.host.failure import fail
 from embomatrix.starter.archive import unpack
+from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 from embomatrix.world.json_text import parse_json
 
@@ -34,8 +35,12 @@ def demo(
         typer.Option(help=f"Output folder. Default: {DEFAULT_OUT}, or the first free {DEFAULT_OUT}-2, -3 …"),
     ] = None,
     dataset: Annotated[
-        Path, typer.Option(help="Dataset folder. If it is missing, the shipped tasks are unpacked there.")
-    ] = Path("build/dataset"),
+        Path,
+        typer.Option(
+            help="Folder of the dataset. If it is missing, the shipped tasks are unpacked there.",
+            envvar=DATASET_VARIABLE,
+        ),
+    ] = DEFAULT_DATASET,
     workers: Annotated[int, typer.Option(min=1, max=64, help="Workers on this machine.")] = 2,
     slots: Annotated[int, typer.Option(min=1, max=64, help="Slots per worker.")] = 1,
     steps: Annotated[int, typer.Option(min=0, help="Steps of GRPO.")] = GRPO_STEPS,

@@ -23,10 +23,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from embomatrix.host.failure import INTERRUPTED, fail
 from embomatrix.host.limits import usable_cores
+from embomatrix.host.own_files import is_own
 from embomatrix.host.printable import printable
 from embomatrix.rpc.options import Ca, Token, add_settings, given_options
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET, default_dataset
 from embomatrix.trainer.cluster.executor import Executor
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_toml, settings_error
@@ -42,6 +44,7 @@ from embomatrix.trainer.evaluation.answer_sources import (
 )
 from embomatrix.trainer.evaluation.answers import (
     FILE,
+    HEADER,
     MOST_SAMPLES,
     Answer,
     AnswerSheet,
@@ -59,8 +62,10 @@ from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.task import MAX_TABLE, Profile
 from embomatrix.world.whole_file import write_whole
 
-DEFAULT_BENCH: Final = "build/dataset"
 DEFAULT_OUT: Final = Path("runs/eval")
+REPORTS: Final = ("report.json", "report.txt", "report.html")
+REPORT_MARK: Final = b'"report": '
+"""Part of the first bytes of each report.json."""
 ENDPOINT_TOKENS: Final = 1024
 """Enough for a plan of 64 steps in JSON and some reasoning before it."""
 Exam = WorldExam | NativeExam
@@ -141,7 +146,11 @@ def evaluate(
     bench: Annotated[
         str,
         _option(
-            _BENCH, help="eai-native, eai, internal-verified-2, a dataset folder, or a file of task records."
+            _BENCH,
+            "--bench",
+            "--dataset",
+            help="eai-native, eai, internal-verified-2, the folder of a dataset, or a file of task records. "
+            f"Default: ${DATASET_VARIABLE}, or {DEFAULT_DATASET}.",
         ),
     ] = "",
     split: Annotated[
@@ -188,8 +197,11 @@ def evaluate(
         if training is not None and baseline not in SCRIPTS:
             raise TrainerError(f"--training is for the baselines {' and '.join(SCRIPTS)}: leave it out")
         label = model or model_name or str(baseline)
-        with _exam(open_executor, bench or DEFAULT_BENCH, split, settings.tasks, settings.profile) as exam:
+        with _exam(
+            open_executor, bench or str(default_dataset()), split, settings.tasks, settings.profile
+        ) as exam:
             folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
+            _check_reports(folder)
             rows = [read_row(path, exam.digest) for path in beside or []]
             if baseline is not None:
                 subject = Subject(functools.partial(ask_script, _baseline(exam, baseline, training)))
@@ -370,12 +382,23 @@ def _judge_stored(
                 f"{exam.digest[:19]}…): pass the benchmark of the answers with --bench"
             )
         check_expected(stored, exam.task_ids, setup, path)
+        _check_reports(out or path.parent)
         given = ordered(stored, exam.task_ids, setup.samples)
         expected = len(exam.task_ids) * setup.samples
         if len(given) < expected:
             missing = expected - len(given)
             console.print(f"{missing} of {expected} answers are missing: the figures leave them out")
         _judge(exam, setup, given, out or path.parent, [read_row(row, exam.digest) for row in beside])
+
+
+def _check_reports(folder: Path) -> None:
+    """Raise TrainerError if a report would replace a file that no evaluation wrote."""
+    if is_own(folder / FILE, HEADER) or is_own(folder / REPORTS[0], REPORT_MARK):
+        return
+    if found := [folder / name for name in REPORTS if (folder / name).exists()]:
+        raise TrainerError(
+            f"{found[0]} was not written by an evaluation: pass another --out, or move it away"
+        )
 
 
 def _judge(
@@ -386,9 +409,9 @@ def _judge(
         result = exam.judge(setup, given, on_progress)
     report = report_of(setup, result)
     text = printable(text_report(report, rows), lines=True)
-    _write(folder / "report.json", json.dumps(report, indent=1) + "\n")
-    _write(folder / "report.txt", text)
-    _write(folder / "report.html", evaluation_page(report, result.pictures, rows))
+    texts = (json.dumps(report, indent=1) + "\n", text, evaluation_page(report, result.pictures, rows))
+    for name, content in zip(REPORTS, texts, strict=True):
+        _write(folder / name, content)
     console.print(text)
     console.print(f"judged in {time.monotonic() - began_s:.1f} s: {folder / 'report.html'}, .json, .txt")
 

@@ -33,7 +33,8 @@ from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for, situation_of
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, Plan
 from embomatrix.skills.trace import Trace
-from embomatrix.starter.shipped import DATASET_VARIABLE, DEFAULT_DATASET, dataset_folder
+from embomatrix.starter.options import DatasetOrShipped
+from embomatrix.starter.shipped import dataset_folder
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset, TaskRecord
 from embomatrix.world.evaluate import GoalError
@@ -86,12 +87,7 @@ def play(
     interactive: Annotated[
         bool, typer.Option("--interactive", help="Play by hand: type one call a line, and see what it does.")
     ] = False,
-    dataset: Annotated[
-        Path | None,
-        typer.Option(
-            help=f"Folder of the dataset. Default: ${DATASET_VARIABLE}, or {DEFAULT_DATASET}, or the shipped tasks."
-        ),
-    ] = None,
+    dataset: DatasetOrShipped = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the execution.")] = 0,
     mode: Annotated[
         PlayMode,

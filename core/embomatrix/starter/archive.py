@@ -82,6 +82,19 @@ def pack(dataset: Dataset, file: Path) -> str:
     return f"sha256:{hashed.hexdigest()}"
 
 
+def is_shipped(dataset: Dataset) -> bool:
+    """Return True if a dataset has the records of the shipped one. Bundles are not compared."""
+    with (
+        resources.as_file(resources.files("embomatrix.starter") / ARCHIVE) as shipped,
+        lzma.open(shipped, "rb") as packed,
+    ):
+        head: Mapping[str, Any] = json.loads(packed.readline(_HEAD_BYTES))
+    found = json.loads(json.dumps([record_to_json(record) for record in dataset.records]))
+    return [{**value, "bundle": 0} for value in found] == [
+        {**value, "bundle": 0} for value in head["records"]
+    ]
+
+
 def unpack(folder: Path, file: Path | None = None) -> str:
     """Write the shipped dataset, or that of a file, to a folder. Return its content digest. Raises DatasetError or OSError."""
     if file is not None:

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Final
 
 from embomatrix.starter.archive import ARCHIVE, unpack
+from embomatrix.starter.options import DATASET_VARIABLE, default_dataset
 from embomatrix.world.dataset import TASKS_FILE
 
 SHIPPED: Final = "shipped"
 """Name of the shipped policy, where a command takes a policy."""
-DATASET_VARIABLE: Final = "EMBOMATRIX_DATASET"
-DEFAULT_DATASET: Final = Path("build/dataset")
 _POLICY: Final = "policy"
 
 
@@ -25,9 +24,8 @@ def dataset_folder(named: Path | None) -> Path:
     """
     if named is not None:
         return named
-    if chosen := os.environ.get(DATASET_VARIABLE):
-        return Path(chosen)
-    return DEFAULT_DATASET if DEFAULT_DATASET.exists() else _unpacked_tasks()
+    folder = default_dataset()
+    return folder if os.environ.get(DATASET_VARIABLE) or folder.exists() else _unpacked_tasks()
 
 
 def shipped_policy() -> Path:

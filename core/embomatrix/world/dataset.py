@@ -133,7 +133,7 @@ class Dataset:
         raise DatasetError(
             f"there is no task {task_id!r} in {self.folder}: "
             f"{_closest(task_id, [record.task.task_id for record in self.records])} "
-            f"(`embomatrix factory list {self.folder}` lists all tasks)"
+            f"(`embomatrix factory list --dataset={self.folder}` lists all tasks)"
         )
 
 

@@ -31,11 +31,11 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize(
     ("command", "status"),
     [
-        ("factory list {}", 0),
+        ("factory list --dataset={}", 0),
         ("play [red]task --oracle --dataset={}", 0),
         ("play [red]task --plan=- --dataset={}", 1),
         ("factory inspect [red]task --dataset={}", 2),
-        ("factory verify {} --physical --jobs=1", 2),
+        ("factory verify --dataset={} --physical --jobs=1", 2),
     ],
 )
 def test_texts_of_a_dataset_are_shown_as_text(folder, command, status):

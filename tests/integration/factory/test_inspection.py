@@ -125,18 +125,18 @@ def test_inspect_writes_a_page_and_suggests_close_task_ids(dataset, tmp_path):
 def test_scene_pictures_are_rendered_once(dataset, tmp_path):
     folder = tmp_path / "data"
     shutil.copytree(dataset.folder, folder)
-    done = [CliRunner().invoke(app, ["pictures", str(folder)]) for _ in range(2)]
+    done = [CliRunner().invoke(app, ["pictures", "--dataset", str(folder)]) for _ in range(2)]
     bundles = {record.bundle_digest.removeprefix("sha256:") for record in dataset.records}
     assert {file.stem for file in (folder / "pictures").glob("*.jpg")} == bundles
     assert [result.output.split(" pictures")[0].split()[-1] for result in done] == [f"{len(bundles)}", "0"]
-    wrong = CliRunner().invoke(app, ["pictures", str(tmp_path / "nowhere")])
+    wrong = CliRunner().invoke(app, ["pictures", "--dataset", str(tmp_path / "nowhere")])
     assert (wrong.exit_code, "there is no dataset" in " ".join(wrong.output.split())) == (2, True)
 
 
 def test_export_replaces_its_own_files_but_no_others(dataset, tmp_path):
     def export(*options):
         return CliRunner().invoke(
-            app, ["export", str(dataset.folder), "--out", str(tmp_path / "t.jsonl"), *options]
+            app, ["export", "--dataset", str(dataset.folder), "--out", str(tmp_path / "t.jsonl"), *options]
         )
 
     notes = tmp_path / "README.md"
@@ -174,7 +174,9 @@ def test_hub_library_reads_file_and_card(dataset, tmp_path):
     pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'embomatrix[export]'")
     folder, cache = tmp_path / "export", str(tmp_path / "cache")
     folder.mkdir()
-    done = CliRunner().invoke(app, ["export", str(dataset.folder), "--out", str(folder / "tasks.parquet")])
+    done = CliRunner().invoke(
+        app, ["export", "--dataset", str(dataset.folder), "--out", str(folder / "tasks.parquet")]
+    )
     assert done.exit_code == 0, done.output
     (read,) = library.load_dataset(str(folder), cache_dir=cache).values()
     assert list(read.features) == list(FIELDS)
@@ -199,7 +201,9 @@ def test_card_counts_tasks_and_explains_every_field(dataset):
 
 
 def test_export_writes_the_card_beside_the_file(dataset, tmp_path):
-    done = CliRunner().invoke(app, ["export", str(dataset.folder), "--out", str(tmp_path / "tasks.jsonl")])
+    done = CliRunner().invoke(
+        app, ["export", "--dataset", str(dataset.folder), "--out", str(tmp_path / "tasks.jsonl")]
+    )
     assert done.exit_code == 0, done.output
     assert (tmp_path / "README.md").read_text().startswith("---\n")
     assert (tmp_path / "tasks.jsonl").read_text().count("\n") == len(dataset.records)

@@ -293,7 +293,7 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def test_list_shows_the_tasks(folder: Path, dataset: Dataset) -> None:
-    code, output = run("list", str(folder), "--limit=1000")
+    code, output = run("list", "--dataset", str(folder), "--limit=1000")
     assert code == 0
     assert "heldout" in output
     assert all(f"{record.task.task_id}\n" in output for record in dataset.records)
@@ -301,21 +301,21 @@ def test_list_shows_the_tasks(folder: Path, dataset: Dataset) -> None:
 
 
 def test_list_selects_tasks_and_shows_them_in_pages(folder: Path, dataset: Dataset) -> None:
-    code, output = run("list", str(folder), "--json", "--split=heldout")
+    code, output = run("list", "--dataset", str(folder), "--json", "--split=heldout")
     assert code == 0
     assert [each["task"] for each in json.loads(output)] == [
         record.task.task_id for record in dataset.heldout
     ]
     one = dataset.records[0].task
     wanted = (f"--search={one.task_id}", f"--scene={one.scene_id}", f"--category={one.category}")
-    code, output = run("list", str(folder), *wanted)
+    code, output = run("list", "--dataset", str(folder), *wanted)
     assert (code, "tasks 1 to 1 of 1\n" in output) == (0, True), output
-    code, output = run("list", str(folder), "--limit=1", "--page=2")
+    code, output = run("list", "--dataset", str(folder), "--limit=1", "--page=2")
     assert code == 0
     assert dataset.records[1].task.task_id in output
     assert dataset.records[0].task.task_id not in output
-    assert "none of" in run("list", str(folder), "--search=no such words")[1]
-    assert run("list", str(folder), "--split=test")[0] == 2
+    assert "none of" in run("list", "--dataset", str(folder), "--search=no such words")[1]
+    assert run("list", "--dataset", str(folder), "--split=test")[0] == 2
 
 
 def test_bddl_file_is_imported_and_its_plan_printed(tmp_path: Path) -> None:
@@ -353,7 +353,7 @@ def test_invalid_bddl_exits_with_2_and_one_sentence(tmp_path: Path, old: str, ne
         (["import", "--activity", "bringin_water"], "did you mean bringing_water"),
         (["import"], "exactly one of"),
         (["import", "--bddl", "OUT/none.bddl"], "can't be read"),
-        (["list", "OUT/none"], "no dataset"),
+        (["list", "--dataset=OUT/none"], "no dataset"),
         (["generate", "--out", "OUT/a", "--llm", "http://127.0.0.1:9/v1"], "needs the name of a model"),
         (["generate", "--out", "OUT/a", "--cassette", "OUT/none.jsonl"], "record one first"),
         (["build", "--out", "OUT/a", "--agent", "room-organiser=llm"], "NAME one of scene-distributor"),

@@ -141,21 +141,21 @@ def test_evaluate_writes_the_figures_of_scripts(kitchen, tmp_path) -> None:
 
 
 def test_difficulty_is_stored_and_listed(copied) -> None:
-    result = CliRunner().invoke(app, ["difficulty", str(copied), "--jobs=1"])
+    result = CliRunner().invoke(app, ["difficulty", "--dataset", str(copied), "--jobs=1"])
     assert result.exit_code == 0, result.output
     records = Dataset.load(copied).records
     assert all(record.difficulty is not None for record in records)
     assert [record.difficulty.steps for record in records] == [len(record.oracle) for record in records]
-    listed = CliRunner().invoke(app, ["list", str(copied)])
+    listed = CliRunner().invoke(app, ["list", "--dataset", str(copied)])
     assert " · hard" in listed.output
     stored = (copied / TASKS_FILE).read_bytes()
-    assert CliRunner().invoke(app, ["difficulty", str(copied), "--again"]).exit_code == 0
+    assert CliRunner().invoke(app, ["difficulty", "--dataset", str(copied), "--again"]).exit_code == 0
     assert (copied / TASKS_FILE).read_bytes() == stored
 
 
 def test_selection_is_a_dataset_of_its_own(copied, tmp_path) -> None:
     options = (f"--out={tmp_path / 'hard'}", "--hard-share=1", "--split=heldout")
-    result = CliRunner().invoke(app, ["difficulty", str(copied), *options])
+    result = CliRunner().invoke(app, ["difficulty", "--dataset", str(copied), *options])
     assert result.exit_code == 0, result.output
     chosen = Dataset.load(tmp_path / "hard")
     assert [record.task.task_id for record in chosen.heldout] == ["tidy_up"]
@@ -175,7 +175,7 @@ def test_selection_is_a_dataset_of_its_own(copied, tmp_path) -> None:
 )
 def test_wrong_options_are_refused_before_anything_is_measured(copied, options, words) -> None:
     before = (copied / TASKS_FILE).read_bytes()
-    result = CliRunner().invoke(app, ["difficulty", str(copied), *options])
+    result = CliRunner().invoke(app, ["difficulty", "--dataset", str(copied), *options])
     assert result.exit_code == 2
     assert words in " ".join(result.output.split())
     assert (copied / TASKS_FILE).read_bytes() == before

@@ -64,7 +64,7 @@ def test_command_judges_tasks_in_other_processes_and_in_physics(tmp_path: "Path"
     write_dataset(folder, [first, other], bundles)
     file = tmp_path / "verified.json"
     result = CliRunner().invoke(
-        app, ["verify", str(folder), "--physical", "--jobs", "1", "--json", str(file)]
+        app, ["verify", "--dataset", str(folder), "--physical", "--jobs", "1", "--json", str(file)]
     )
     assert result.exit_code == 1
     assert f"{other.task.task_id}: two processes, or one of them and the dataset, differ" in result.output
@@ -74,6 +74,6 @@ def test_command_judges_tasks_in_other_processes_and_in_physics(tmp_path: "Path"
 
 def test_dataset_without_tasks_is_reported(tmp_path: "Path") -> None:
     write_dataset(tmp_path, [], {})
-    result = CliRunner().invoke(app, ["verify", str(tmp_path)])
+    result = CliRunner().invoke(app, ["verify", "--dataset", str(tmp_path)])
     assert result.exit_code == 2
     assert "contains no task" in result.output

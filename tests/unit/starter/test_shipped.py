@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from embomatrix.starter import shipped
+from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
 from embomatrix.world.dataset import TASKS_FILE
 
 
@@ -21,7 +22,7 @@ def unpacked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
 
     monkeypatch.setattr(shipped, "unpack", unpack)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv(shipped.DATASET_VARIABLE, raising=False)
+    monkeypatch.delenv(DATASET_VARIABLE, raising=False)
     monkeypatch.chdir(tmp_path)
     return folders
 
@@ -29,10 +30,10 @@ def unpacked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
 def test_named_folder_comes_before_the_variable_and_the_default(
     unpacked: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shipped.DEFAULT_DATASET.mkdir(parents=True)
+    DEFAULT_DATASET.mkdir(parents=True)
     assert shipped.dataset_folder(Path("mine")) == Path("mine")
-    assert shipped.dataset_folder(None) == shipped.DEFAULT_DATASET
-    monkeypatch.setenv(shipped.DATASET_VARIABLE, "other")
+    assert shipped.dataset_folder(None) == DEFAULT_DATASET
+    monkeypatch.setenv(DATASET_VARIABLE, "other")
     assert shipped.dataset_folder(None) == Path("other")
     assert not unpacked
 

@@ -17,6 +17,7 @@ from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_table, be
 from embomatrix.bench.experiments.conduct import Conductor, Venue, own_venue
 from embomatrix.bench.experiments.design import (
     RELEVANCE_ARMS,
+    SECTION_FILE,
     Arm,
     Budget,
     Design,
@@ -37,6 +38,7 @@ from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores
 from embomatrix.pages.figures import Figure
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import checked_settings
 from embomatrix.trainer.logging.outcome import read_outcome
@@ -89,7 +91,6 @@ _Arm = Annotated[
     typer.Option(metavar="NAME:KEY=VALUE,...", help="Settings of an arm; NAME alone: defaults. Repeatable."),
 ]
 _Out = Annotated[Path | None, typer.Option(help="Folder of all runs; the same command resumes them.")]
-_Dataset = Annotated[Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter`.")]
 _Title = Annotated[str, typer.Option(help="Heading of the section.")]
 _Seeds = Annotated[
     list[int] | None,
@@ -122,7 +123,7 @@ def _experiment(preset: Preset, summary: str) -> Callable[..., None]:
     def command(
         arm: _Arm = None,
         out: _Out = preset.out,
-        dataset: _Dataset = Path("build/dataset"),
+        dataset: DatasetFolder = DEFAULT_DATASET,
         title: _Title = preset.title,
         seeds: _Seeds = None,
         minutes: _Minutes = preset.minutes,
@@ -257,7 +258,7 @@ def _conduct(
     if not arms:
         raise TrainerError(f"no run in {out} is finished: give the command without --so-far")
     hand_in(BenchResult(f"experiment {design.name}", commit, machine, figures_of(arms)), json_file)
-    _publish(learning_section(design, arms, machine, commit, date.today()), out / "section.md", page)
+    _publish(learning_section(design, arms, machine, commit, date.today()), out / SECTION_FILE, page)
 
 
 def _publish(section: str, own: Path, page: Path | None) -> None:

@@ -16,6 +16,8 @@ WITH_RELEVANCE: Final = "with-relevance"
 WITHOUT_RELEVANCE: Final = "without-relevance"
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
 _FILE: Final = "design.json"
+SECTION_FILE: Final = "section.md"
+"""Report of the experiment in its folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +127,10 @@ def keep_design(folder: Path, design: Design) -> None:
                 "another --out"
             )
         return
+    if (folder / SECTION_FILE).exists():
+        raise TrainerError(
+            f"{folder / SECTION_FILE} belongs to no experiment: pass another --out, or move it away"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(path, (json.dumps(value, indent=1) + "\n").encode("utf-8"))
 

@@ -168,6 +168,11 @@ def _trials(
                 f"{folder} holds a suite of other settings or another dataset: name another folder with --out"
             )
         return tuple(trial_from_json(value) for value in _lines(folder / PLANS_FILE))
+    for name in (PLANS_FILE, RESULTS_FILE):
+        if (folder / name).exists():
+            raise BenchError(
+                f"{folder / name} belongs to no suite: name another folder with --out, or move it away"
+            )
     trials = write_all_trials(dataset, settings, modes, on_step)
     text = "".join(json.dumps(trial_to_json(trial)) + "\n" for trial in trials)
     write_whole(folder / PLANS_FILE, text.encode("utf-8"))

@@ -71,9 +71,13 @@ def _arm(out: Path, seed: int, options: Mapping[str, int], on_step: OnStep) -> P
     if (out / COST).exists():
         return out
     on_step(out.name)
+    log = out.with_suffix(f".{LOG}")
+    if out.exists() and not log.exists():
+        raise BenchError(
+            f"{out} was not written by this command: name another folder with --out, or move it away"
+        )
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    log = out.with_suffix(f".{LOG}")
     given = [f"--{name}={value}" for name, value in options.items()]
     where = [f"--out={out}", f"--dataset={out.parent / 'dataset'}"]
     began, spent = time.monotonic(), _children_s()

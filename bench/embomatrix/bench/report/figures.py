@@ -16,6 +16,8 @@ from embomatrix.pages.figures import Better, Figure, figure_from_json, figure_to
 from embomatrix.worker.host.gpu import find_gpu
 from embomatrix.worker.host.resources import measure_score, versions
 
+RESULT_MARK: Final = b'"bench": '
+"""Part of the first bytes of each file of a result."""
 BUSY_SHARE: Final = 0.25
 """Load of a core above which a machine counts as shared before a benchmark begins."""
 

@@ -76,7 +76,10 @@ def recorded_traffic(record: Path, dataset: Path) -> RecordedTraffic:
 
 
 def save_sample(record: Path, dataset: Path, out: Path, scenes: int, seed: int) -> RecordedTraffic:
-    """Write a random sample of a recorded run's scenes with all their groups of both phases. Raise BenchError."""
+    """Write a random sample of a recorded run's scenes with all their groups of both phases, over an earlier sample.
+
+    Raise BenchError.
+    """
     whole = recorded_traffic(record, dataset)
     chosen = set(random.Random(seed).sample(sorted(whole.bundles), min(scenes, len(whole.bundles))))
     contents = {digest: zlib.decompress(whole.bundles[digest]) for digest in chosen}

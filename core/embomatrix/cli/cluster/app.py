@@ -20,10 +20,11 @@ from embomatrix.cli.cluster.tables import (
     step_line,
     worker_table,
 )
-from embomatrix.cli.cluster.trace import chrome_trace
+from embomatrix.cli.cluster.trace import TRACE_MARK, chrome_trace
 from embomatrix.cli.connection import AsJson, manager_command
 from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
+from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign
 from embomatrix.host.printable import printable
 from embomatrix.rpc.admin_client import AdminClient
 
@@ -130,6 +131,7 @@ async def report(
     run: Run,
     out: Out = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures instead.")] = False,
+    force: Force = False,
 ) -> None:
     """Write the report of an open or closed run as one self-contained HTML file, ID.html by default."""
     run_id = await client.find_run(run)
@@ -139,19 +141,21 @@ async def report(
         return
     from embomatrix.cli.cluster.report import report_page
 
-    _write(out or Path(f"{run_id}.html"), report_page(summary, await client.all_events(run_id)))
+    file = out or _free(Path(f"{run_id}.html"), PAGE_MARK, force=force)
+    _write(file, report_page(summary, await client.all_events(run_id)))
 
 
 @app.command()
 @manager_command("cluster")
-async def trace(client: AdminClient, run: Run, out: Out = None) -> None:
+async def trace(client: AdminClient, run: Run, out: Out = None, force: Force = False) -> None:
     """Write a run as a Chrome trace for https://ui.perfetto.dev, ID.trace.json by default."""
     run_id = await client.find_run(run)
+    file = out or _free(Path(f"{run_id}.trace.json"), TRACE_MARK, force=force)
     summary = await client.run(run_id)
     page = chrome_trace(
         await client.all_events(run_id), await client.all_events(), summary.run.name or run_id
     )
-    _write(out or Path(f"{run_id}.trace.json"), json.dumps(page, separators=(",", ":")))
+    _write(file, json.dumps(page, separators=(",", ":")))
 
 
 @app.command()
@@ -206,6 +210,12 @@ def _list(found: Sequence[T], table: Callable[[Sequence[T]], Table], nothing: st
         show(table(found))
     else:
         print(nothing)
+
+
+def _free(path: Path, mark: bytes, *, force: bool) -> Path:
+    """Return the path of a file whose name the user did not choose. Exit if another file has it."""
+    keep_foreign("cluster", [path], mark, force=force)
+    return path
 
 
 def _write(path: Path, text: str) -> None:

@@ -11,6 +11,8 @@ from typing import Any, Final
 from embomatrix.rpc.timeline import SlotKey, Span, slot_spans
 from embomatrix.rpc.wire.run_log import EventKind, RunEvent
 
+TRACE_MARK: Final = b'{"otherData":{"generator":"EmboMatrix"}'
+"""First bytes of each trace."""
 MANAGER: Final = 1
 """Process id of the manager's track; workers follow."""
 SUBMISSION_US: Final = 1000.0
@@ -37,7 +39,7 @@ def chrome_trace(run: Sequence[RunEvent], fleet: Sequence[RunEvent], name: str) 
         ),
         *_fleet(fleet, processes, clock),
     ]
-    return {"traceEvents": events, "displayTimeUnit": "ms"}
+    return {"otherData": {"generator": "EmboMatrix"}, "traceEvents": events, "displayTimeUnit": "ms"}
 
 
 class _Clock:

@@ -52,28 +52,17 @@ from embomatrix.host.commands import command_group
 from embomatrix.llm.batch import FailureLimit
 from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.rpc.options import Ca, Token
+from embomatrix.starter.options import DatasetCommand
 
 app = command_group(help="Build and inspect datasets of verified tasks.")
 app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
-app.command("list")(list_)
+app.command("list", cls=DatasetCommand)(list_)
 app.command("try")(try_)
-for command in (
-    agent,
-    lay,
-    inspect,
-    pictures,
-    corpus,
-    starter,
-    merge,
-    verify,
-    audit,
-    evaluate,
-    difficulty,
-    prompts,
-    export,
-):
+for command in (agent, lay, inspect, corpus, starter, merge, evaluate):
     app.command()(command)
+for reader in (pictures, verify, audit, difficulty, prompts, export):
+    app.command(cls=DatasetCommand)(reader)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
 SocialLlm = Annotated[

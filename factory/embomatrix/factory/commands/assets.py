@@ -14,9 +14,11 @@ from embomatrix.factory.commands.terminal import say, show_table, user_errors
 from embomatrix.factory.importers.assemble import ImportedAsset, import_model, read_model
 from embomatrix.factory.importers.convex import Coacd, by_components
 from embomatrix.factory.importers.model import AxisConvention, ModelFileError
-from embomatrix.factory.importers.shelf import save_asset
+from embomatrix.factory.importers.shelf import ASSET_MARK, asset_file, save_asset
 from embomatrix.factory.pictures.assets import draw_sheet
+from embomatrix.factory.pictures.marked_files import write_picture
 from embomatrix.host.commands import command_group
+from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign
 from embomatrix.world.asset import Asset, Credit
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.records import SceneInvalidError
@@ -69,16 +71,22 @@ def check(
 
 @app.command()
 def draw(
-    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("assets.png"),
+    out: Annotated[
+        Path | None, typer.Option(help="PNG file to write. Default: assets.png in the current folder.")
+    ] = None,
     category: Categories = None,
     every_model: Annotated[bool, typer.Option("--every-model", help="All models of a category.")] = False,
+    force: Force = False,
 ) -> None:
     """Draw assets side by side, closed and open. Default: all categories that open, heat or cool."""
     catalog = Catalog.load()
     chosen = category or [name for name in catalog.used_categories if _is_worth_a_look(catalog, name)]
-    with user_errors(out, more=(ValueError,)):
-        draw_sheet(_assets(catalog, chosen, every_model=every_model)).save(out)
-    say(out)
+    file = out or Path("assets.png")
+    if out is None:
+        keep_foreign("", [file], PICTURE_MARK, force=force)
+    with user_errors(file, more=(ValueError,)):
+        write_picture(file, draw_sheet(_assets(catalog, chosen, every_model=every_model)))
+    say(file)
 
 
 @app.command("import")
@@ -99,6 +107,7 @@ def import_(
         AxisConvention | None, typer.Option(help="Axis that points up: y (OBJ, GLB) or z (STL, URDF).")
     ] = None,
     cut: Annotated[Cut, typer.Option(help="Convex decomposition of meshes.")] = Cut.COACD,
+    force: Force = False,
 ) -> None:
     """Import a model file as an asset that replaces one of the catalog's models in `scene build --assets`."""
     credit = Credit(creator, licence, source or file.name)
@@ -106,6 +115,7 @@ def import_(
         raw = read_model(file, up)
         decompose = Coacd() if cut is Cut.COACD else by_components
         imported = import_model(Catalog.load(), raw, category, model, credit, decompose)
+        keep_foreign("", [asset_file(out, imported.asset)], ASSET_MARK, force=force)
         path = save_asset(out, imported.asset)
     _tell(imported, path)
     say(_stands_in(imported.asset.asset_id))

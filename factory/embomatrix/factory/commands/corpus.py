@@ -15,6 +15,7 @@ from embomatrix.factory.pipeline.corpus import (
     STARTER,
     TASKS,
     CorpusSettings,
+    check_free,
     check_frozen,
     freeze,
     join_parts,
@@ -68,6 +69,7 @@ def corpus(
                 look_ahead,
                 in_physics(physical, look_ahead=look_ahead),
             )
+            check_free(out)
             unpack(part_folder(out, STARTER))
             starter = Dataset.load(part_folder(out, STARTER))
             builds = settings.builds(starter)

@@ -15,13 +15,15 @@ from embomatrix.factory.evaluate.readings import prompts_of
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows, is_card_of
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.host.printable import printable
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder, DatasetOrShipped
+from embomatrix.starter.shipped import dataset_folder
 from embomatrix.world.dataset import SPLITS, Dataset, TaskRecord
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
 
 
 def list_(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
+    dataset: DatasetOrShipped = None,
     split: Annotated[str, typer.Option(help="Only tasks of this split: train or heldout.")] = "",
     scene: Annotated[
         str, typer.Option(help="Only tasks of this base scene, such as Rs_int, or of one of its variants.")
@@ -36,7 +38,7 @@ def list_(
     with user_errors():
         if split not in ("", *SPLITS):
             fail(f"--split {split!r}: expected {' or '.join(SPLITS)}")
-        records = Dataset.load(folder).records
+        records = Dataset.load(dataset_folder(dataset)).records
     found = list(_selected(records, split, scene, category, search))
     if as_json:
         typer.echo(json.dumps([_in_json(record) for record in found], indent=1))
@@ -100,22 +102,22 @@ def _show_position(found: int, all_: int, page: int, limit: int, shown: int) -> 
 
 
 def prompts(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
     out: Annotated[Path, typer.Option(help="Text file to write.")],
+    dataset: DatasetFolder = DEFAULT_DATASET,
     tasks: Annotated[int, typer.Option(min=1, help="Number of held-out tasks.")] = 40,
 ) -> None:
     """Write the prompts of held-out tasks, without their goals, for a person or a model to answer."""
     with user_errors(out):
-        write_whole(out, prompts_of(Dataset.load(folder), tasks).encode("utf-8"))
+        write_whole(out, prompts_of(Dataset.load(dataset), tasks).encode("utf-8"))
     say(f"prompts: {out}; `factory evaluate readings` judges the answers")
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
     out: Annotated[
         Path,
         typer.Option(help="File to write, .jsonl or .parquet. The card, README.md, is written beside it."),
     ],
+    dataset: DatasetFolder = DEFAULT_DATASET,
     force: Annotated[
         bool, typer.Option("--force", help="Replace files there that an earlier export did not write.")
     ] = False,
@@ -123,8 +125,8 @@ def export(
     """Export a dataset for other tools, one row per task, with a dataset card."""
     card = out.with_name("README.md")
     with user_errors(out):
-        dataset = Dataset.load(folder)
-        data = encode_rows(export_rows(dataset), out.suffix)
+        found = Dataset.load(dataset)
+        data = encode_rows(export_rows(found), out.suffix)
         exported = card.exists() and is_card_of(card.read_text(encoding="utf-8", errors="replace"), out.name)
         foreign = [path for path in (card, out) if path.exists() and not exported]
         if foreign and not force:
@@ -133,5 +135,5 @@ def export(
                 "replace it"
             )
         write_whole(out, data)
-        write_whole(card, dataset_card(dataset, out.name, data).encode("utf-8"))
-    say(f"{len(dataset.records)} tasks: {out}, card: {card}")
+        write_whole(card, dataset_card(found, out.name, data).encode("utf-8"))
+    say(f"{len(found.records)} tasks: {out}, card: {card}")

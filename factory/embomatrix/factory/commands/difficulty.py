@@ -17,13 +17,15 @@ from embomatrix.factory.evaluate.difficulty import (
     with_scripts,
 )
 from embomatrix.factory.evaluate.scripts import ScriptResults, run_scripts, write_plans
+from embomatrix.host.own_files import Force
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, TaskRecord, encode_records, write_dataset
 from embomatrix.world.difficulty import DifficultyLevel
 from embomatrix.world.whole_file import write_whole
 
 
 def difficulty(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
+    dataset: DatasetFolder = DEFAULT_DATASET,
     training: Annotated[
         Path | None,
         typer.Option(
@@ -50,6 +52,7 @@ def difficulty(
         bool, typer.Option("--again", help="Also measure tasks that have a difficulty.")
     ] = False,
     jobs: Jobs = None,
+    force: Force = False,
 ) -> None:
     """Execute scripts on the tasks and store each task's difficulty in tasks.jsonl.
 
@@ -62,23 +65,33 @@ def difficulty(
         )
     if split and split not in SPLITS:
         fail(f"unknown split {split!r}: expected {' or '.join(SPLITS)}")
-    with user_errors(out or folder):
+    if out is not None:
+        _check_free(out, dataset, force=force)
+    with user_errors(out or dataset):
         shares = shares_of(easy_share, hard_share)
         shares_of_policy = read_policy_shares(policy) if policy is not None else {}
-        dataset = Dataset.load(folder)
-        missing = [record for record in dataset.records if again or record.difficulty is None]
-        results = script_results(
-            dataset, missing, dataset if training is None else Dataset.load(training), jobs
-        )
-        records = with_policy(with_scripts(dataset.records, results), shares_of_policy)
-        write_whole(folder / TASKS_FILE, encode_records(records))
+        found = Dataset.load(dataset)
+        missing = [record for record in found.records if again or record.difficulty is None]
+        results = script_results(found, missing, found if training is None else Dataset.load(training), jobs)
+        records = with_policy(with_scripts(found.records, results), shares_of_policy)
+        write_whole(dataset / TASKS_FILE, encode_records(records))
         _print_levels(records)
         if out is not None:
             chosen = selected(records, shares, (split,) if split else SPLITS)
             digests = dict.fromkeys(record.bundle_digest for record in chosen)
-            write_dataset(out, chosen, {digest: dataset.bundle_bytes(digest) for digest in digests})
+            write_dataset(out, chosen, {digest: found.bundle_bytes(digest) for digest in digests})
             _print_levels(chosen)
             say(f"{len(chosen)} of {len(records)} tasks: {out}")
+
+
+def _check_free(out: Path, dataset: Path, *, force: bool) -> None:
+    """Exit if a selection would replace the tasks that it is made of, or those of another dataset."""
+    if out.resolve() == dataset.resolve():
+        fail(
+            f"a selection in {out} would replace the tasks that it is made of: name another folder with --out"
+        )
+    if not force and (out / TASKS_FILE).exists():
+        fail(f"{out} holds a dataset already: name another folder with --out, or pass --force to replace it")
 
 
 def script_results(

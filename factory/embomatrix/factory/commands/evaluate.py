@@ -33,10 +33,16 @@ from embomatrix.factory.evaluate.scenes import (
 from embomatrix.factory.evaluate.scripts import evaluate_scripts
 from embomatrix.factory.evaluate.skills import evaluate_skills, needed_in_dataset
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
-from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures, read_evaluation
+from embomatrix.factory.metrics.figures import (
+    FIGURES_MARK,
+    EvaluationError,
+    EvaluationFigures,
+    read_evaluation,
+)
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
 from embomatrix.factory.task_import.sources import SourceText
+from embomatrix.host.own_files import Force, keep_foreign
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.starter.archive import unpack
@@ -112,6 +118,7 @@ def evaluate(
     page: Annotated[
         Path | None, typer.Option(help="Page with the factory's section to update, docs/benchmarks.md.")
     ] = None,
+    force: Force = False,
 ) -> None:
     """Measure parts of the factory: tasks, scripts, skills, answers of readers, rooms, layouts, admission, lies, aesthetics.
 
@@ -146,6 +153,8 @@ def evaluate(
                 )
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
+            figures = [out / f"{part}.json" for part in parts if part in measures]
+            keep_foreign("", figures, FIGURES_MARK, force=force)
         evaluations = []
         for part in parts:
             measured = part in measures

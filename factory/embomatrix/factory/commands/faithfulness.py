@@ -15,12 +15,13 @@ from embomatrix.factory.evaluate.faithfulness import (
     read_answers,
 )
 from embomatrix.factory.evaluate.verification import sampled
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
 
 
 def audit(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
+    dataset: DatasetFolder = DEFAULT_DATASET,
     plans: Annotated[int, typer.Option(min=0, help="Plans to try for each task.")] = 200,
     answers: Annotated[
         Path | None,
@@ -42,18 +43,17 @@ def audit(
     with user_errors(json_file):
         if json_file is not None:
             check_writable(json_file)
-        dataset = Dataset.load(folder)
-        records = sampled(dataset.records, sample, seed)
+        records = sampled(Dataset.load(dataset).records, sample, seed)
         if not records:
-            fail(f"{folder} contains no task: name a dataset with tasks")
+            fail(f"{dataset} contains no task: name a dataset with tasks")
         given = read_answers(answers) if answers is not None else PolicyAnswers()
         with counter("tasks", len(records)) as count:
             audits = audit_dataset(
-                folder, records, plans=plans, answers=given, jobs=processes(jobs), progress=count
+                dataset, records, plans=plans, answers=given, jobs=processes(jobs), progress=count
             )
     for line in objections(audits):
         say(line)
-    conditions = {"dataset": folder.name, "tasks": len(audits), "seed": seed}
+    conditions = {"dataset": dataset.name, "tasks": len(audits), "seed": seed}
     report_evaluation(evaluation_of(audits, conditions), json_file)
     if any(each.shortcut or each.findings for each in audits):
         raise typer.Exit(1)

@@ -9,6 +9,9 @@ from embomatrix.factory.commands.terminal import progress, say, user_errors
 from embomatrix.factory.inspection.page import scene_jpeg, scene_picture, task_page
 from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
+from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder, DatasetOrShipped
+from embomatrix.starter.shipped import dataset_folder
 from embomatrix.world.dataset import Dataset, bundle_file
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import check_writable, write_whole
@@ -19,21 +22,24 @@ CARD_PX = (720, 540)
 
 def inspect(
     task: Annotated[str, typer.Argument(help="Id of the task, as `factory list` shows it.")],
-    dataset: Annotated[Path, typer.Option(help="Folder of the dataset.")] = Path("build/dataset"),
+    dataset: DatasetOrShipped = None,
     out: Annotated[
         Path | None, typer.Option(help="File for the page. Default: TASK.html in the current folder.")
     ] = None,
     picture: Annotated[bool, typer.Option(help="Include a rendered picture of the scene.")] = True,
+    force: Force = False,
 ) -> None:
     """Write a task as one HTML file: instruction, transcript, layout, objects, and the oracle's plan step by step."""
     file = out or Path(f"{task}.html")
     with user_errors(file):
-        loaded = Dataset.load(dataset)
+        loaded = Dataset.load(dataset_folder(dataset))
         record = loaded.find(task)
+        if out is None:
+            keep_foreign("", [file], PAGE_MARK, force=force)
         check_writable(file)
         bundle = loaded.bundle(record.bundle_digest)
-        transcript = _text(dataset / TRANSCRIPTS_FOLDER / f"{task}.md")
-        tree = _text(dataset / TREES_FOLDER / f"{task}.json")
+        transcript = _text(loaded.folder / TRANSCRIPTS_FOLDER / f"{task}.md")
+        tree = _text(loaded.folder / TREES_FOLDER / f"{task}.json")
         page = task_page(
             record,
             bundle.scene,
@@ -46,9 +52,7 @@ def inspect(
     say(f"page: {file}")
 
 
-def pictures(
-    dataset: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
-) -> None:
+def pictures(dataset: DatasetFolder = DEFAULT_DATASET) -> None:
     """Render the scene of each bundle for the dashboard's gallery. Existing pictures are kept."""
     folder = dataset / PICTURES_FOLDER
     with user_errors(folder, kept=": finished pictures are kept"):

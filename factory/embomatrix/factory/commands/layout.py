@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -22,12 +22,16 @@ from embomatrix.factory.evaluate.scenes import LayoutMethod, PoseSource
 from embomatrix.factory.layout.agent_interfaces import LAYOUT_AGENTS, AgentName
 from embomatrix.factory.layout.generator import lay as lay_by_tree
 from embomatrix.factory.layout.request import Layout, LayoutRecord, RequestedObject
+from embomatrix.factory.pictures.marked_files import write_picture
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.scenes.base_scenes import base_scenes
 from embomatrix.factory.scenes.editor import SceneEditor
 from embomatrix.factory.task_import.sources import read_activity, read_file
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
+from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign
+from embomatrix.world.whole_file import write_whole
 
+PLAN: Final = "plan.png"
 Out = Annotated[
     Path | None, typer.Option(help="Folder for a picture of the plan and for the brief of each agent.")
 ]
@@ -45,6 +49,7 @@ def lay(
     model: Model = "",
     key: Key = "",
     cassette: Tape = None,
+    force: Force = False,
 ) -> None:
     """Lay the objects of one task out in a base scene and print the layout trees. Nothing is executed."""
     names = model_backed_agents(forms)
@@ -75,13 +80,14 @@ def lay(
         for layout in layouts:
             _show(layout)
         if out is not None:
+            keep_foreign("", [out / PLAN], PICTURE_MARK, force=force)
             out.mkdir(parents=True, exist_ok=True)
             for layout in layouts:
-                _write_briefs(out, layout.record)
+                _write_briefs(out, layout.record, force=force)
         if isinstance(imported, TaskRefusal):
             fail(f"{source.name} is refused ({imported.reason}): {imported.sentence}")
         if out is not None:
-            draw_plan(imported.scene).save(out / "plan.png")
+            write_picture(out / PLAN, draw_plan(imported.scene))
             say(f"pictures and briefs: {out}")
 
 
@@ -95,7 +101,7 @@ def _show(layout: Layout) -> None:
         )
 
 
-def _write_briefs(out: Path, record: LayoutRecord) -> None:
+def _write_briefs(out: Path, record: LayoutRecord, *, force: bool) -> None:
     """Write every brief as a file that ``factory agent NAME --in`` reads."""
     briefs: list[tuple[AgentName, object]] = [
         *([(AgentName.DISTRIBUTOR, record.distribution[0])] if record.distribution else []),
@@ -103,6 +109,12 @@ def _write_briefs(out: Path, record: LayoutRecord) -> None:
         *((AgentName.PLANNER, brief) for brief, _ in record.constraints),
         *((AgentName.SOLVER, brief) for brief, _ in record.planes),
     ]
-    for number, (name, brief) in enumerate(briefs):
-        path = out / f"{number:02d}-{name.value}.json"
-        path.write_bytes(LAYOUT_AGENTS[name].brief.dump_json(brief, indent=1))
+    files = {
+        out / f"{number:02d}-{name.value}.json": LAYOUT_AGENTS[name].brief.dump_json(brief, indent=1)
+        for number, (name, brief) in enumerate(briefs)
+    }
+    for path, text in files.items():
+        # The first line and the first key are those of every brief of the agent.
+        keep_foreign("", [path], text[: text.find(b":")], force=force)
+    for path, text in files.items():
+        write_whole(path, text)

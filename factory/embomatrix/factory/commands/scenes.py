@@ -1,10 +1,8 @@
 """``embomatrix scene``: build, list, show, draw and check base scenes."""
 
-import io
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -20,6 +18,7 @@ from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
 from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
+from embomatrix.factory.pictures.marked_files import write_picture
 from embomatrix.factory.pictures.relations import draw_relations
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import (
@@ -33,9 +32,10 @@ from embomatrix.factory.pictures.sheet import (
 from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene, build_house
 from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem_lines, report_table
-from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
+from embomatrix.factory.scenes.scene_file import SCENE_MARKS, SUFFIX, SceneFileError, read_scene
 from embomatrix.host.commands import command_group
 from embomatrix.host.limits import usable_cores
+from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import write_whole
@@ -57,15 +57,6 @@ class PictureFormat(StrEnum):
 
     PNG = "png"
     JPEG = "jpg"
-
-
-@dataclass(frozen=True, slots=True)
-class ScenePicture:
-    """Picture with the name of its file without suffix; a ``rendered`` one has soft shades, any other lines and text."""
-
-    title: str
-    image: Image.Image
-    rendered: bool = False
 
 
 SceneIds = Annotated[
@@ -118,7 +109,6 @@ Assets = Annotated[Path | None, typer.Option(help="Folder of imported assets tha
 Background = Annotated[
     bool, typer.Option(help="Fill homes with background objects, as many as real rooms hold.")
 ]
-JPEG_QUALITY = 85
 VIEW_PX = (1280, 960)
 """Size of the oblique view of a scene."""
 CORES = usable_cores()
@@ -144,6 +134,7 @@ def build(
     jobs: Jobs = CORES,
     assets: Assets = None,
     background: Background = True,
+    force: Force = False,
 ) -> None:
     """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 if one has a problem."""
     chosen = _chosen(scene_ids, every)
@@ -168,6 +159,7 @@ def build(
         for name, house in houses.items()
         for seed in dict.fromkeys(seeds or (0,))
     ]
+    keep_foreign("", [order.path for order in orders if order.path is not None], *SCENE_MARKS, force=force)
     reports = _run(orders, jobs)
     say(orders[0].path if len(orders) == 1 else out)
     for done in reports:
@@ -231,6 +223,7 @@ def draw(
     out: Out = Path(),
     labels: LabelsOption = False,
     file_format: FormatOption = PictureFormat.PNG,
+    force: Force = False,
 ) -> None:
     """Draw scenes or examples of the relations as PNG files in a folder."""
     if labels and kind is not Drawing.SCENE:
@@ -245,45 +238,48 @@ def draw(
         out.mkdir(parents=True, exist_ok=True)
         with progress() as bars:
             built = [_built(name, seed) for name in bars.track(names, description="scenes")]
-        for picture in _tagged_pictures(built) if labels else _pictures(kind, built):
-            say(_written(picture, out, file_format))
+        titles = _titles(kind, built)
+        files = {
+            each: out / f"{each}.{file_format if rendered else PictureFormat.PNG}"
+            for each, rendered in titles.items()
+        }
+        keep_foreign("", files.values(), PICTURE_MARK, force=force)
+        for title, picture in _tagged_pictures(built) if labels else _pictures(kind, built):
+            write_picture(files[title], picture)
+            say(files[title])
 
 
-def _written(picture: ScenePicture, out: Path, file_format: PictureFormat) -> Path:
-    """Write a picture into a folder and return its path."""
-    used = file_format if picture.rendered else PictureFormat.PNG
-    buffer = io.BytesIO()
-    if used is PictureFormat.PNG:
-        picture.image.save(buffer, format="PNG", optimize=True)
-    else:
-        picture.image.save(buffer, format="JPEG", optimize=True, quality=JPEG_QUALITY)
-    file = out / f"{picture.title}.{used}"
-    write_whole(file, buffer.getvalue())
-    return file
+def _titles(kind: Drawing, scenes: Sequence[Scene]) -> dict[str, bool]:
+    """Return the titles of all pictures of a kind: True for rendered ones, which have soft shades, not lines and text."""
+    if kind is not Drawing.SCENE:
+        return {kind.value: kind is not Drawing.SHEET}
+    return {
+        f"{scene.scene_id}_{view}": view != "plan" for scene in scenes for view in ("plan", "view", "eyes")
+    }
 
 
-def _tagged_pictures(scenes: Sequence[Scene]) -> Iterator[ScenePicture]:
-    """Yield the pictures of each scene, with names in all of them. Raise EngineError without pybullet."""
+def _tagged_pictures(scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
+    """Yield the pictures of each scene with their titles, names in all of them. Raise EngineError without pybullet."""
     for scene in scenes:
-        yield ScenePicture(f"{scene.scene_id}_plan", draw_plan(scene))
-        yield ScenePicture(f"{scene.scene_id}_view", draw_tagged_oblique(scene, VIEW_PX), rendered=True)
-        yield ScenePicture(f"{scene.scene_id}_eyes", draw_tagged_eyes(scene), rendered=True)
+        yield f"{scene.scene_id}_plan", draw_plan(scene)
+        yield f"{scene.scene_id}_view", draw_tagged_oblique(scene, VIEW_PX)
+        yield f"{scene.scene_id}_eyes", draw_tagged_eyes(scene)
 
 
-def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[ScenePicture]:
-    """Yield pictures of a kind. Raise EngineError without pybullet."""
+def _pictures(kind: Drawing, scenes: Sequence[Scene]) -> Iterator[tuple[str, Image.Image]]:
+    """Yield pictures of a kind with their titles. Raise EngineError without pybullet."""
     match kind:
         case Drawing.SCENE:
             for scene in scenes:
-                yield ScenePicture(f"{scene.scene_id}_plan", draw_plan(scene))
-                yield ScenePicture(f"{scene.scene_id}_view", draw_oblique(scene, VIEW_PX), rendered=True)
-                yield ScenePicture(f"{scene.scene_id}_eyes", draw_eyes(scene), rendered=True)
+                yield f"{scene.scene_id}_plan", draw_plan(scene)
+                yield f"{scene.scene_id}_view", draw_oblique(scene, VIEW_PX)
+                yield f"{scene.scene_id}_eyes", draw_eyes(scene)
         case Drawing.SHEET:
-            yield ScenePicture("sheet", draw_sheet(scenes).quantize(64))
+            yield "sheet", draw_sheet(scenes).quantize(64)
         case Drawing.VIEWS:
-            yield ScenePicture("views", draw_views(scenes), rendered=True)
+            yield "views", draw_views(scenes)
         case Drawing.RELATIONS:
-            yield ScenePicture("relations", draw_relations(), rendered=True)
+            yield "relations", draw_relations()
 
 
 def _run(orders: Sequence[SceneBuildJob], jobs: int) -> list[SceneReport]:

@@ -14,13 +14,14 @@ from embomatrix.factory.commands.terminal import check_output, counter, fail, sa
 from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import DEFAULT_SCENES
 from embomatrix.factory.pipeline.store import ResumableLog
-from embomatrix.factory.scenes.base_scenes import base_scenes, keep_scenes
+from embomatrix.factory.scenes.base_scenes import base_scenes, check_scenes_free, keep_scenes
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.factory.task_import.batch import Imported, Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.importer import Depth, ImportSettings, importing
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
+    REPORT_MARK,
     ProblemOutcome,
     changed_problems,
     evaluation_of,
@@ -38,6 +39,7 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
+from embomatrix.host.own_files import Force, keep_foreign
 from embomatrix.world.bddl import BddlError, BddlProblem
 from embomatrix.world.dataset import TASKS_FILE, DatasetError, write_dataset
 from embomatrix.world.scene import Scene
@@ -90,6 +92,7 @@ def import_(
     json_file: Rates = None,
     outcomes: Kept = None,
     jobs: Jobs = None,
+    force: Force = False,
 ) -> None:
     """Bind BDDL problems to base scenes and verify them. Refusals are reported with a reason."""
     depth = Depth.INSTANTIATE if instantiate else Depth.BIND if bind_only else Depth.VERIFY
@@ -98,11 +101,15 @@ def import_(
     )
     for file in (report, json_file):
         check_output(file)
+    if report is not None:
+        keep_foreign("", {report.with_suffix(".md")} - {report}, REPORT_MARK, force=force)
     with user_errors(out or outcomes, kept):
         if out is not None:
             _check_free(out, depth, outcomes)
         sources = _selected(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
         settings = ImportSettings(base_scenes(scenes or DEFAULT_SCENES), seed, depth, look_ahead)
+        if out is not None:
+            check_scenes_free(out, settings.scenes.own.values())
         log = _resumed_log(outcomes, sources, settings)
         made = _import_all(sources[len(log.outcomes) :], settings, processes(jobs), log)
         admitted = out is None or _written(out, made, settings.scenes.own)

@@ -13,7 +13,7 @@ from embomatrix.factory.commands.options import Seed
 from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.inspection.page import scene_picture, task_page
 from embomatrix.factory.inspection.playing import OraclePlayback, play_oracle
-from embomatrix.factory.scenes.base_scenes import BaseScenes, base_scenes, keep_scenes
+from embomatrix.factory.scenes.base_scenes import BaseScenes, base_scenes, drop_scenes, keep_scenes
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.sources import ProblemSourceError
@@ -25,7 +25,14 @@ from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.state.facts import FactError
 from embomatrix.world.bundle import Bundle, decode_bundle
-from embomatrix.world.dataset import BUNDLES_FOLDER, TASKS_FILE, Dataset, bundle_file, write_dataset
+from embomatrix.world.dataset import (
+    BUNDLES_FOLDER,
+    TASKS_FILE,
+    Dataset,
+    DatasetError,
+    bundle_file,
+    write_dataset,
+)
 from embomatrix.world.evaluate import GoalError, scored_atoms
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import check_writable, write_whole
@@ -171,7 +178,12 @@ def _check_free(folder: Path, task_file: TaskFile) -> None:
     """Raise ProblemSourceError if the folder holds a dataset other than an earlier trial of the same file."""
     if not (folder / TASKS_FILE).exists():
         return
-    records = Dataset.load(folder).records
+    try:
+        records = Dataset.load(folder).records
+    except DatasetError as error:
+        raise ProblemSourceError(
+            f"{folder / TASKS_FILE} is not an earlier trial of this file: name another folder with --out"
+        ) from error
     words = records[0].task.task_id.split("-") if len(records) == 1 else []
     is_trial = len(words) > 1 and words[1] == slug_of(task_file.source.name)
     if not is_trial or records[0].task.source != SOURCE:
@@ -184,6 +196,8 @@ def _check_free(folder: Path, task_file: TaskFile) -> None:
 def _save(folder: Path, verified: Verified, chosen: BaseScenes) -> None:
     """Replace an earlier trial's dataset."""
     old = Dataset.load(folder).records if (folder / TASKS_FILE).exists() else ()
+    if old:
+        drop_scenes(folder, chosen.own.values())
     keep_scenes(folder, chosen.own.values())
     write_dataset(folder, [verified.record], {verified.record.bundle_digest: verified.bundle})
     for record in old:

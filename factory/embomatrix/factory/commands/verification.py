@@ -8,6 +8,7 @@ import typer
 from embomatrix.factory.commands.options import Jobs, processes
 from embomatrix.factory.commands.terminal import counter, fail, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.verification import evaluation_of, objections, sampled, verify_again
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
 
@@ -20,7 +21,7 @@ Figures = Annotated[Path | None, typer.Option("--json", help="File for the figur
 
 
 def verify(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
+    dataset: DatasetFolder = DEFAULT_DATASET,
     physical: Physical = False,
     sample: Sample = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
@@ -34,12 +35,12 @@ def verify(
     with user_errors(json_file):
         if json_file is not None:
             check_writable(json_file)
-        records = sampled(Dataset.load(folder).records, sample, seed)
+        records = sampled(Dataset.load(dataset).records, sample, seed)
         if not records:
-            fail(f"{folder} contains no task: name a dataset with tasks")
+            fail(f"{dataset} contains no task: name a dataset with tasks")
         with counter("judgements", 2 * len(records)) as count:
-            verdicts = verify_again(folder, records, physical=physical, jobs=processes(jobs), progress=count)
-    conditions = {"dataset": folder.name, "tasks": len(verdicts), "seed": seed}
+            verdicts = verify_again(dataset, records, physical=physical, jobs=processes(jobs), progress=count)
+    conditions = {"dataset": dataset.name, "tasks": len(verdicts), "seed": seed}
     for line in objections(verdicts):
         say(line)
     report_evaluation(evaluation_of(verdicts, conditions), json_file)

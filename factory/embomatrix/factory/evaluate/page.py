@@ -60,13 +60,13 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     "verification": (
         "Tasks verified again",
-        "`embomatrix factory verify DATASET --physical` verifies admitted tasks again in two new processes. *oracle_cached* is "
+        "`embomatrix factory verify --physical` verifies admitted tasks again in two new processes. *oracle_cached* is "
         "the share that is admitted again. *reverified_bit_equal* is the share with the dataset's plan and with bit-identical "
         "poses and states after every step. *oracle_physical* is the share whose plan a robot executes in stepped physics.",
     ),
     "faithfulness": (
         "Faithful goals",
-        "`embomatrix factory audit DATASET --plans N` compares what each instruction demands with what its goal scores, and "
+        "`embomatrix factory audit --plans N` compares what each instruction demands with what its goal scores, and "
         "searches for shortcuts: plans that succeed while they violate a relation, source or object that the instruction "
         "states. *shortcut_share* is the share of tasks with one, *relation_swaps* the number of placement tasks solved with "
         "another relation, *unfaithful_share* the share of tasks whose words and goal disagree.",

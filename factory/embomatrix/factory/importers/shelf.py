@@ -13,14 +13,21 @@ from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.whole_file import read_whole, write_whole
 
 SUFFIX: Final = ".asset.json"
+ASSET_MARK: Final = b'"asset_id"'
+"""Part of the first bytes of each file."""
 MAX_BYTES: Final = 4 * 1024 * 1024
 """Far more than an asset takes that has as many parts as the engine holds."""
+
+
+def asset_file(folder: Path, asset: Asset) -> Path:
+    """Return the file of an asset in a folder."""
+    return folder / f"{asset.asset_id}{SUFFIX}"
 
 
 def save_asset(folder: Path, asset: Asset) -> Path:
     """Write an asset into a folder, which is made when it is missing, and return its file. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{asset.asset_id}{SUFFIX}"
+    path = asset_file(folder, asset)
     write_whole(path, json.dumps(asset_to_json(asset), indent=1).encode())
     return path
 

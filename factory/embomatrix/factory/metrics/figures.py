@@ -4,11 +4,14 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from embomatrix.pages.figures import Figure, figure_from_json, figure_to_json
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
+
+FIGURES_MARK: Final = b'"part": '
+"""Part of the first bytes of each file of figures."""
 
 
 class EvaluationError(Exception):

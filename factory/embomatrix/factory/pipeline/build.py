@@ -25,7 +25,7 @@ from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.household import place_of
 from embomatrix.factory.writer.tasks import TaskWriter
 from embomatrix.sim.process_pool import shared_work
-from embomatrix.world.dataset import DatasetError, TaskRecord, write_dataset
+from embomatrix.world.dataset import TASKS_FILE, DatasetError, TaskRecord, write_dataset
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
 
@@ -258,6 +258,10 @@ def build_dataset(
 def _store_in(folder: Path, settings: BuildSettings, own: Sequence[Scene]) -> BuildStore:
     """Start or resume a build. The scenes of files are written before it starts, and compared when it is resumed."""
     if not (folder / BUILD_FILE).exists():
+        if (folder / TASKS_FILE).exists():
+            raise DatasetError(
+                f"{folder} holds a dataset that no build wrote: name another folder with --out, or remove this one"
+            )
         keep_scenes(folder, own)
     store = BuildStore(folder, dataclasses.asdict(settings))
     check_kept(folder, own)

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from embomatrix.factory.pipeline.merge import MergeSummary, Resolution, merge_datasets
+from embomatrix.factory.pipeline.merge import MERGED_FILE, MergeSummary, Resolution, merge_datasets
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.starter.archive import RECIPE
@@ -94,6 +94,16 @@ def training_scenes() -> tuple[str, ...]:
 def part_folder(folder: Path, part: str) -> Path:
     """Return the folder of a part of the corpus."""
     return folder / PARTS / part
+
+
+def check_free(folder: Path) -> None:
+    """Raise DatasetError if the folder holds tasks that no earlier build of a corpus wrote."""
+    for name, mark in ((TASKS, MERGED_FILE), (VERIFIED, FROZEN_FILE)):
+        path = folder / name
+        if path.exists() and not (path / mark).exists() and (not path.is_dir() or any(path.iterdir())):
+            raise DatasetError(
+                f"{path} was not written by `factory corpus`: name another folder with --out, or move it away"
+            )
 
 
 def join_parts(folder: Path, parts: Sequence[str]) -> MergeSummary:

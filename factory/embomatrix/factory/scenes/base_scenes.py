@@ -96,11 +96,35 @@ def scene_digest(scene: Scene) -> str:
 
 
 def keep_scenes(folder: Path, own: Iterable[Scene]) -> None:
-    """Write scenes into a dataset's folder, so that it can be built again elsewhere. Raises OSError."""
+    """Write scenes into a dataset's folder, so that it can be built again elsewhere.
+
+    Raises DatasetError if another scene of this name is there; OSError.
+    """
+    check_scenes_free(folder, own := tuple(own))
     for scene in own:
-        target = folder / SCENES_FOLDER
-        target.mkdir(parents=True, exist_ok=True)
-        write_whole(target / f"{scene.base}{SUFFIX}", _encoded(scene))
+        path = _kept_file(folder, scene)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, _encoded(scene))
+
+
+def check_scenes_free(folder: Path, own: Iterable[Scene]) -> None:
+    """Raise DatasetError if a dataset's folder holds another scene in the place of one of these; OSError."""
+    for scene in own:
+        path = _kept_file(folder, scene)
+        if path.exists() and read_whole(path, at_most=MAX_BYTES) != _encoded(scene):
+            raise DatasetError(
+                f"{path} is another scene than the one that the dataset needs: name another folder with --out"
+            )
+
+
+def drop_scenes(folder: Path, own: Iterable[Scene]) -> None:
+    """Remove the scenes of these names from an earlier dataset of the same command. Raises OSError."""
+    for scene in own:
+        _kept_file(folder, scene).unlink(missing_ok=True)
+
+
+def _kept_file(folder: Path, scene: Scene) -> Path:
+    return folder / SCENES_FOLDER / f"{scene.base}{SUFFIX}"
 
 
 def check_kept(folder: Path, own: Sequence[Scene]) -> None:

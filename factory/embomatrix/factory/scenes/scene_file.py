@@ -13,6 +13,8 @@ from embomatrix.world.whole_file import read_whole, write_whole
 SUFFIX: Final = ".json"
 MAX_BYTES: Final = 64 * 1024 * 1024
 """Upper limit for a scene file, more than ten times the largest base scene."""
+SCENE_MARKS: Final = (b'"scene_id"', b'"base"')
+"""Parts of the first bytes of each scene file."""
 
 
 class SceneFileError(ValueError):

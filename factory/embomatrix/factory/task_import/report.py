@@ -26,6 +26,8 @@ FIGURES: Final[Mapping[str, tuple[str, float]]] = {
 }
 """Name and target of the figure for each source."""
 SOLVED_GOAL: Final = 0.95
+REPORT_MARK: Final = b"# Imported problems"
+"""First line of each report in Markdown."""
 FAITHFUL_GOAL: Final = 0.6
 
 
@@ -128,7 +130,7 @@ def changed_problems(outcomes: Sequence[ProblemOutcome]) -> list[tuple[SceneChan
 def report_to_markdown(outcomes: Sequence[ProblemOutcome]) -> str:
     """Return the report as Markdown."""
     bound = sum(outcome.is_bound for outcome in outcomes)
-    lines = ["# Imported problems", "", f"{bound} of {len(outcomes)} are bound to a scene.", ""]
+    lines = [REPORT_MARK.decode(), "", f"{bound} of {len(outcomes)} are bound to a scene.", ""]
     refused = Counter(outcome.reason for outcome in outcomes if outcome.reason)
     if refused:
         lines += ["| refused | problems |", "| --- | ---: |"]

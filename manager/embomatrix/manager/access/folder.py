@@ -106,6 +106,10 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
     folder = AccessFolder(data_dir)
     try:
         target.mkdir(parents=True, exist_ok=True)
+        if (target / "ca.pem").exists() and not (target / "token").exists():
+            raise AccessError(
+                f"{target / 'ca.pem'} was not handed out here: name another folder, or move it away"
+            )
         write_whole(target / "ca.pem", folder.ca.read_bytes(), mode=_PUBLIC)
         if not (target / "token").exists():
             write_whole(target / "token", folder.token(role).read_bytes(), mode=_SECRET)

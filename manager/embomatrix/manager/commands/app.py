@@ -19,6 +19,7 @@ from embomatrix.rpc.options import Ca, LogLines, Manager, Token, add_settings, g
 from embomatrix.rpc.status import ClusterError, InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca, read_token
 from embomatrix.rpc.wire.tokens import AccessRole, TokenInfo
+from embomatrix.starter.options import DATASET_VARIABLE
 
 if TYPE_CHECKING:
     from embomatrix.rpc.admin_client import AdminClient
@@ -48,6 +49,14 @@ def serve(
             show_default=False,
         ),
     ] = "",
+    dataset: Annotated[
+        Path | None,
+        typer.Option(
+            envvar=DATASET_VARIABLE,
+            help="Folder of the dataset whose tasks the dashboard shows. It is never written. Default: none.",
+            show_default=False,
+        ),
+    ] = None,
     log_level: Annotated[
         str,
         typer.Option(help="debug, info, warning or error; debug also checks invariants."),

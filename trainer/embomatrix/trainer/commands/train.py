@@ -19,6 +19,7 @@ from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
 from embomatrix.rpc.options import Ca, Manager, Token
 from embomatrix.rpc.trust import read_ca, read_token
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.trainer.config.errors import TrainerError
 
 if TYPE_CHECKING:
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
 
 Connect = Callable[[], ClusterClient]
 
-_DATASET = Annotated[
-    Path, typer.Option(help="Dataset folder, such as that of `embomatrix factory starter` or `generate`.")
-]
 _LOG_FORMAT = Annotated[
     LogFormat | None,
     typer.Option(
@@ -71,7 +69,7 @@ _PROCESSES = Annotated[
 
 
 def train(
-    dataset: _DATASET = Path("build/dataset"),
+    dataset: DatasetFolder = DEFAULT_DATASET,
     manager: Manager = DEFAULT_ADDRESS,
     model: _MODEL = "tiny",
     out: _OUT = Path("runs/train"),
@@ -123,7 +121,7 @@ def train(
 
 
 def imitate(
-    dataset: _DATASET = Path("build/dataset"),
+    dataset: DatasetFolder = DEFAULT_DATASET,
     model: _MODEL = "tiny",
     out: _OUT = Path("runs/imitate"),
     seconds: Annotated[float | None, typer.Option(min=0, help="Seconds of imitation. Default: 150.")] = None,

@@ -27,6 +27,8 @@ LIBRARIES: Final = ("future==1.0.0", "networkx>=3.2,<4", "numpy>=1.26,<3", "pyya
 PACKAGE_PREFIX: Final = "behavior_eval/"
 """Part of the package that we unpack: VirtualHome's half has 389 of its 410 MB."""
 READY: Final = "ready.json"
+BEGUN: Final = "eai-judge"
+"""Mark of a folder that an installation made: an unfinished one is removed and made again."""
 
 
 def default_folder() -> Path:
@@ -67,14 +69,17 @@ def install(
 ) -> JudgeEnvironment:
     """Create the environment (150 MB) with pip's configured package index. A complete installation is kept.
 
-    Raises TrainerError that quotes pip.
+    Raises TrainerError that quotes pip, or names a folder with other files.
     """
     root = folder or default_folder()
     if (root / READY).is_file():
         return JudgeEnvironment(root)
+    if root.exists() and not (root / BEGUN).exists() and (not root.is_dir() or any(root.iterdir())):
+        raise TrainerError(f"{root} is not empty and holds no installation of the judge: name another folder")
     shutil.rmtree(root, ignore_errors=True)
     try:
-        root.parent.mkdir(parents=True, exist_ok=True)
+        root.mkdir(parents=True)
+        (root / BEGUN).write_bytes(b"")
         on_progress("making a virtual environment")
         _run(sys.executable, "-m", "venv", str(root))
         pip = (str(root / "bin" / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check")

@@ -21,6 +21,8 @@ from embomatrix.world.json_text import parse_json
 VERSION: Final = 1
 """Version of the file format and of everything that a verdict depends on."""
 FILE: Final = "answers.jsonl"
+HEADER: Final = b'{"answers": '
+"""First bytes of each answer file."""
 MOST_SAMPLES: Final = 1000
 """Maximum samples per task."""
 CODECS: Final = "|".join([*Codec, "eai"])
@@ -81,7 +83,10 @@ class AnswerSheet:
     def __enter__(self) -> Self:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            exists = self.path.exists() and b"\n" in self.path.read_bytes()
+            before = self.path.read_bytes() if self.path.exists() else b""
+            exists = b"\n" in before
+            if not exists and not HEADER.startswith(before[: len(HEADER)]):
+                raise TrainerError(f"{self.path} is not an answer file: pass another --out, or move it away")
             if exists:
                 self._load()
             self._file = self.path.open("ab" if exists else "wb")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from embomatrix.host.limits import usable_cores
+from embomatrix.host.own_files import is_own
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import (
     LANGUAGE_MODEL_DEFAULTS,
@@ -17,11 +18,17 @@ from embomatrix.trainer.config.settings import (
 from embomatrix.trainer.data.tasks import TaskSet, load_tasks
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
+from embomatrix.trainer.logging.evaluations import EVALUATIONS
+from embomatrix.trainer.logging.outcome import OUTCOME
+from embomatrix.trainer.logging.recorder import IMITATION, METRICS, SAMPLES
+from embomatrix.trainer.logging.report import REPORT
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.loading import TINY, configure_torch, is_word_level, new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
 
+LOG_MARK: Final = b'{"step"'
+"""First bytes of each log of a run."""
 REFERENCE: Final = "reference"
 """Folder of the policy after imitation in a run's folder."""
 CHANGEABLE: Final = frozenset(
@@ -67,6 +74,7 @@ def start_run(
         settings = settings.model_copy(update={"processes": _processes_for(settings)})
     if any((out / CHECKPOINTS).glob("[!.]*")):
         raise TrainerError(f"{out} holds another run: pass --resume to continue it, or another --out")
+    _check_free(out)
     configure_torch(settings.threads, settings.device)
     tasks = load_tasks(dataset)
     policy = new_policy(settings, tasks)
@@ -77,6 +85,19 @@ def start_run(
             f"the folder {out} can't be created ({error.strerror}): pass another --out"
         ) from error
     return RunStart(settings, tasks, policy, TrainingProgress(dataset=digest_of(tasks)))
+
+
+def _check_free(out: Path) -> None:
+    """Raise TrainerError if a new run would overwrite or change a file in its folder.
+
+    The logs of a run that ended before its first checkpoint may go on.
+    """
+    results = (out / name for name in (REFERENCE, REPORT, OUTCOME))
+    logs = (out / name for name in (METRICS, SAMPLES, IMITATION, EVALUATIONS))
+    found = [path for path in results if path.exists()]
+    found += [path for path in logs if path.exists() and path.stat().st_size and not is_own(path, LOG_MARK)]
+    if found:
+        raise TrainerError(f"a new run would overwrite {found[0]}: pass another --out, or move it away")
 
 
 def default_threads() -> int:

@@ -1,5 +1,6 @@
 """`embomatrix worker install`: a systemd unit that runs the worker permanently."""
 
+import itertools
 import re
 import shutil
 import stat
@@ -11,6 +12,7 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
+from embomatrix.host.own_files import Force, is_own
 from embomatrix.worker.commands.options import fail
 from embomatrix.worker.commands.run import settings_of
 
@@ -19,6 +21,8 @@ USER_UNITS: Final = Path("~/.config/systemd/user")
 SYSTEM_UNITS: Final = Path("/etc/systemd/system")
 SYSTEM_STATE: Final = Path("/var/lib/embomatrix-worker")
 """Only folder that a system unit may write. A manager has another, because each has a dedicated user."""
+UNIT_MARK: Final = b"Description=EmboMatrix worker:"
+"""Begin of the line by which a unit of this command is known."""
 STOP_S: Final = 90
 """Longer than a drain, so that running rollouts may end."""
 FILES: Final = frozenset({"--config", "--ca", "--token"})
@@ -36,6 +40,7 @@ def install(
     system: Annotated[
         bool, typer.Option("--system", help="Install for the whole machine, started at boot; needs root.")
     ] = False,
+    force: Force = False,
 ) -> None:
     """Write a systemd unit that runs `embomatrix worker run` with the options that follow `--`."""
     if sys.platform != "linux":
@@ -46,6 +51,10 @@ def install(
     if system:
         _check_for_all(words, command)
     target = (folder or (SYSTEM_UNITS if system else USER_UNITS)).expanduser() / UNIT
+    if not force and target.exists() and not is_own(target, UNIT_MARK):
+        fail(
+            f"{target} was not written by this command: name another folder with --folder, or pass --force to replace it"
+        )
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(unit_text(command, words, system=system), encoding="utf-8")
@@ -110,7 +119,7 @@ def unit_text(command: Sequence[str], words: Sequence[str], *, system: bool) -> 
         system_lines = f"DynamicUser=yes\nStateDirectory={SYSTEM_STATE.name}\nStateDirectoryMode=0700\n"
         system_lines += f"Environment=HOME={SYSTEM_STATE}\n" + "".join(f"{line}\n" for line in credentials)
     return f"""[Unit]
-Description=EmboMatrix worker: lends this machine to a simulation manager
+{UNIT_MARK.decode()} lends this machine to a simulation manager
 After=network-online.target
 Wants=network-online.target
 
@@ -160,7 +169,7 @@ def quote(word: str) -> str:
 
 def _check(words: Sequence[str]) -> None:
     """Refuse options that would end the worker later, in the background."""
-    for option, value in zip(words, [*words[1:], ""], strict=True):
+    for option, value in itertools.zip_longest(words, words[1:], fillvalue=""):
         if option == "--join" or (option == "--token" and not value.startswith("@")):
             fail(
                 "every user can read a token in a unit: put it in a file of mode 600, "
