@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -66,6 +66,12 @@ def check_asset(asset: Asset) -> None:
     if len(_SOUND) >= ASSETS_KEPT:
         _SOUND.clear()
     _SOUND[id(asset)] = asset
+
+
+def check_again(assets: Iterable[Asset]) -> None:
+    """Forget that these assets passed: their scene is closed, and nothing else may hold them."""
+    for asset in assets:
+        _SOUND.pop(id(asset), None)
 
 
 _SOUND: Final[dict[int, Asset]] = {}

@@ -29,7 +29,7 @@ from embomatrix.sim.engine import (
 )
 from embomatrix.sim.geometry.bounds import AssetBounds, bounds_of, forget
 from embomatrix.sim.geometry.spatial_hash import SpatialHash
-from embomatrix.sim.validation import check_fractions, check_pose, check_scene
+from embomatrix.sim.validation import check_again, check_fractions, check_pose, check_scene
 from embomatrix.world.geometry import IDENTITY, Aabb, Pose
 from embomatrix.world.scene import Scene
 
@@ -46,17 +46,23 @@ class BulletEngine:
     """Scene in one Bullet client, with a second one for settling. Not thread-safe."""
 
     def __init__(
-        self, scene: Scene, pool: ClientPool | None = None, prepared: PreparedScene | None = None
+        self,
+        scene: Scene,
+        pool: ClientPool | None = None,
+        prepared: PreparedScene | None = None,
+        *,
+        keeps_bounds: bool = False,
     ) -> None:
         """Load the scene into clients of the pool, or into new ones that close with the engine.
 
+        With ``keeps_bounds``, the bounds of its assets outlive it, for a next scene that has nearly the same assets.
         A scene with ``prepared`` boxes comes from a bundle and was checked there. Raises EngineError for an invalid scene or
         if pybullet is missing.
         """
         if prepared is None:
             check_scene(scene)
         self._scene = scene
-        self._is_prepared = prepared is not None
+        self._keeps_bounds = keeps_bounds
         self._owns_pool = pool is None
         self._pool = pool or ClientPool()
         self._bullet = self._pool.take()
@@ -264,8 +270,9 @@ class BulletEngine:
 
     def close(self) -> None:
         self._mini.close()
-        if self._is_prepared:  # the scenes of a layout, which are not, have nearly the same assets
+        if not self._keeps_bounds:
             forget(self._scene.assets.values())
+            check_again(self._scene.assets.values())
         self._pool.give_back(self._bullet)
         if self._owns_pool:
             self._pool.close()

@@ -53,7 +53,9 @@ def settle(
     loose = {name for name in names if not editor.known(name).fixed and not is_provably_stable(editor, name)}
     rested: dict[str, Pose] = {}
     unstable: dict[str, str] = {}
-    with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id), shared_pool())) as engine:
+    with contextlib.closing(
+        BulletEngine(editor.freeze(editor.base.scene_id), shared_pool(), keeps_bounds=True)
+    ) as engine:
         probe = _ReachProbe(engine)
         unreached: dict[str, str] = {}
         for name in [name for name in names if editor.box_of(name).low_m[2] < HIGH_M]:

@@ -10,11 +10,10 @@ from typing import Final, Self
 
 from embomatrix.factory.scenes.view import CapableRobot, SceneView
 from embomatrix.sim.actions import HANDLINGS
-from embomatrix.sim.bullet.client import shared_pool
 from embomatrix.sim.planner.calls import StuckError
 from embomatrix.sim.planner.script import PlanScript
 from embomatrix.sim.planner.subgoals import Exposure, PlacementGoal, Subgoals
-from embomatrix.sim.simulation import load_simulator
+from embomatrix.sim.simulation import load_briefly
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Atom, Formula, Not
@@ -40,7 +39,7 @@ class SimulatedRobot(CapableRobot):
         """
         self._view = SceneView(scene)
         self._blocks = blocks
-        self._simulator = load_simulator(Bundle(scene, {}, PoseCache()), pool=shared_pool())
+        self._simulator = load_briefly(Bundle(scene, {}, PoseCache()))
         self._known: dict[tuple[str, ...], bool] = {}
 
     def __enter__(self) -> Self:
