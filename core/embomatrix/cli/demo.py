@@ -16,14 +16,11 @@ from embomatrix.host.failure import fail
 from embomatrix.starter.archive import unpack
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
-from embomatrix.world.json_text import parse_json
 
 DEFAULT_OUT: Final = Path("runs/demo")
 IMITATION_STEPS: Final = 340
 GRPO_STEPS: Final = 420
 """Budgets in steps: the same seed gives the same curve on a fast machine and on a slow one."""
-OUTCOME_FILE: Final = "outcome.json"
-"""File of a finished run with its success on each held-out task."""
 EVALUATE_EVERY: Final = 70
 """Steps of GRPO between evaluations: five beside those before and after, each in a few seconds."""
 console = Console()
@@ -87,11 +84,11 @@ def demo(
 
 def _most_successful_task(folder: Path) -> str:
     """Return the held-out task that the run's policy solves most often; "" without held-out tasks."""
-    rates: dict[str, float] = {
-        task["task_id"]: task["rate"] or 0.0
-        for task in parse_json((folder / OUTCOME_FILE).read_bytes())["after"]
-    }
-    return max(rates, key=rates.__getitem__, default="")
+    from embomatrix.trainer.logging.outcome import read_outcome
+
+    outcome = read_outcome(folder)
+    best = max(outcome.after or outcome.before, key=lambda task: task.rate or 0.0, default=None)
+    return best.task_id if best is not None else ""
 
 
 def _ensure_tasks(dataset: Path) -> None:

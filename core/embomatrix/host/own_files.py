@@ -13,7 +13,7 @@ HEAD_BYTES: Final = 4096
 PAGE_MARK: Final = b'<meta name="generator" content="EmboMatrix">'
 """Mark of HTML pages."""
 PICTURE_MARK: Final = b"Software\0EmboMatrix"
-"""Mark of PNG files: a text chunk before the pixels."""
+"""Mark of pictures: a text chunk before the pixels of a PNG file, a comment in a JPEG file."""
 Force = Annotated[bool, typer.Option("--force", help="Replace files there that this command did not write.")]
 """Option of commands that choose the names of the files that they write."""
 

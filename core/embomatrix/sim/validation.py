@@ -49,7 +49,7 @@ def check_scene(scene: Scene) -> None:
 
 @functools.lru_cache(maxsize=WALLS_KEPT)
 def _check_wall(wall: ConvexPart) -> None:
-    check_asset(Asset("wall", "wall", "", wall.size_m, 1.0, (Link("base", (wall,)),)))
+    _check(Asset("wall", "wall", "", wall.size_m, 1.0, (Link("base", (wall,)),)))
 
 
 def check_asset(asset: Asset) -> None:
@@ -59,13 +59,17 @@ def check_asset(asset: Asset) -> None:
     """
     if id(asset) in _SOUND:
         return
+    _check(asset)
+    if len(_SOUND) >= ASSETS_KEPT:
+        _SOUND.clear()
+    _SOUND[id(asset)] = asset
+
+
+def _check(asset: Asset) -> None:
     try:
         asset_from_json(asset_to_json(replace(asset, supports=(), interiors=(), abilities={})))
     except SceneInvalidError as error:
         raise EngineError(f"physics can't hold asset {asset.asset_id!r}: {error}") from error
-    if len(_SOUND) >= ASSETS_KEPT:
-        _SOUND.clear()
-    _SOUND[id(asset)] = asset
 
 
 def check_again(assets: Iterable[Asset]) -> None:

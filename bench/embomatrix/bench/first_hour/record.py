@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure, Interval
-from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.trainer.evaluation.intervals import paired_difference
 from embomatrix.world.whole_file import write_whole
 
 RECORD: Final = Path(__file__).parents[1] / "data" / "first_hour.json"
@@ -49,8 +49,7 @@ class SeedRun:
     @property
     def gain(self) -> Interval:
         """Success with GRPO minus success with continued imitation, paired by task, with its 95 % interval over tasks."""
-        pairs = [rate - self.continued.rates[task] for task, rate in self.trained.rates.items()]
-        return bootstrap(pairs)
+        return paired_difference(self.continued.rates, self.trained.rates)
 
 
 def write_record(path: Path, seeds: Sequence[SeedRun]) -> None:

@@ -19,9 +19,9 @@ import torch
 from embomatrix.bench.first_hour.record import Arm, SeedRun
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.host.code_version import commit_here
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.lifecycle.checkpoint import newest_checkpoint, read_state
 from embomatrix.trainer.lifecycle.stopwatch import Activity
-from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome
+from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, rates_by_task, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 
 OnStep = Callable[[str], None]
@@ -42,14 +42,17 @@ def run_seed(seed: int, folder: Path, options: Mapping[str, int], on_step: OnSte
     further = round(outcome.imitation_steps * outcome.grpo_s / outcome.spent_s[Activity.IMITATION])
     steps = {"imitate-steps": outcome.imitation_steps + further, "steps": 0}
     continued = _arm(folder / f"seed-{seed}-imitation", seed, {**options, **steps}, on_step)
-    progress, _ = read_state(_newest(trained))
+    newest = newest_checkpoint(trained)
+    if newest is None:
+        raise BenchError(f"{trained} has no checkpoint: remove it, and run the command again")
+    progress, _ = read_state(newest)
     return SeedRun(
         seed=seed,
         dataset=progress.dataset,
         commit=commit_here(),
         platform=platform_here(),
         curve=curve_digest(read_metrics(trained)),
-        imitated=_rates(outcome.before),
+        imitated=rates_by_task(outcome.before),
         trained=_read_arm(trained, outcome),
         continued=_read_arm(continued, read_outcome(continued)),
     )
@@ -102,16 +105,5 @@ def _children_s() -> float:
 def _read_arm(folder: Path, outcome: RunOutcome) -> Arm:
     cost = json.loads((folder / COST).read_text(encoding="ascii"))
     # Without GRPO, the evaluation after imitation is the last one.
-    rates = _rates(outcome.after or outcome.before)
+    rates = rates_by_task(outcome.after or outcome.before)
     return Arm(rates, outcome.imitation_steps, outcome.steps, cost["wall_s"], cost["core_s"])
-
-
-def _rates(rates: tuple[TaskRate, ...]) -> dict[str, float]:
-    return {rate.task_id: rate.rate for rate in rates if rate.rate is not None}
-
-
-def _newest(folder: Path) -> Path:
-    newest = CheckpointStore(folder / CHECKPOINTS, keep=1).latest()
-    if newest is None:
-        raise BenchError(f"{folder} has no checkpoint: remove it, and run the command again")
-    return newest

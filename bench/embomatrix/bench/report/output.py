@@ -13,6 +13,7 @@ from embomatrix.host.failure import fail
 from embomatrix.pages.figures import shown
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.dataset import DatasetError
 from embomatrix.world.inflation import BundleError
 from embomatrix.world.whole_file import write_whole
@@ -51,5 +52,5 @@ def refusals() -> Iterator[None]:
     """Print one sentence and exit with status 2 for errors that the user can fix."""
     try:
         yield
-    except (BenchError, BundleError, ClusterError, DatasetError, EngineError, OSError) as error:
+    except (BenchError, BundleError, ClusterError, DatasetError, EngineError, TrainerError, OSError) as error:
         fail("bench", str(error))

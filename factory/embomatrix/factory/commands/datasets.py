@@ -14,6 +14,7 @@ from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.evaluate.readings import prompts_of
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows, is_card_of
 from embomatrix.factory.scenes.build import base_scene_of
+from embomatrix.host.own_files import Force
 from embomatrix.host.printable import printable
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder, DatasetOrShipped
 from embomatrix.starter.shipped import dataset_folder
@@ -118,9 +119,7 @@ def export(
         typer.Option(help="File to write, .jsonl or .parquet. The card, README.md, is written beside it."),
     ],
     dataset: DatasetFolder = DEFAULT_DATASET,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace files there that an earlier export did not write.")
-    ] = False,
+    force: Force = False,
 ) -> None:
     """Export a dataset for other tools, one row per task, with a dataset card."""
     card = out.with_name("README.md")

@@ -61,9 +61,7 @@ def lay(
         layout_agents(names, llm, model, key, cassette) as agents,
         poses.methods() as methods,
     ):
-        chosen = base_scenes([scene])
-        if len(chosen.names) > 1:
-            fail(f"--scene {scene} stands for {len(chosen.names)} scenes: name one of them")
+        base = base_scenes([scene]).only(scene)
         source = read_file(bddl) if bddl is not None else read_activity(activity)
         layouts: list[Layout] = []
 
@@ -74,9 +72,7 @@ def lay(
                 layouts.append(methods[method](editor, items, seed))
             return layouts[-1]
 
-        imported = import_problem(
-            source, chosen.built_all()[0], seed=seed, options=ImportOptions(lay=lay_and_keep)
-        )
+        imported = import_problem(source, base, seed=seed, options=ImportOptions(lay=lay_and_keep))
         for layout in layouts:
             _show(layout)
         if out is not None:

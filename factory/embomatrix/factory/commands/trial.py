@@ -10,7 +10,7 @@ import typer
 
 from embomatrix.factory.admission import TaskRefusal, oracle_plan, plan_failure
 from embomatrix.factory.commands.options import Seed
-from embomatrix.factory.commands.terminal import fail, say, user_errors
+from embomatrix.factory.commands.terminal import say, user_errors
 from embomatrix.factory.inspection.page import scene_picture, task_page
 from embomatrix.factory.inspection.playing import OraclePlayback, play_oracle
 from embomatrix.factory.scenes.base_scenes import BaseScenes, base_scenes, drop_scenes, keep_scenes
@@ -80,10 +80,9 @@ def try_(
     folder = out or DEFAULT_FOLDER / (slug_of(file.stem) or "task")
     with user_errors():
         task_file = read_task_file(file)
-        chosen = base_scenes([scene or task_file.scene or DEFAULT_SCENE])
-        if len(chosen.names) > 1:
-            fail(f"--scene {scene} stands for {len(chosen.names)} scenes: name one of them")
-        base = chosen.built(chosen.names[0])
+        named = scene or task_file.scene or DEFAULT_SCENE
+        chosen = base_scenes([named])
+        base = chosen.only(named)
     with user_errors(folder):
         _check_free(folder, task_file)
     with user_errors(page):

@@ -39,6 +39,12 @@ class BaseScenes:
         """Return all scenes in the order of their names. Raises CatalogError for an unknown name."""
         return [self.built(name, seed=seed) for name in self.names]
 
+    def only(self, word: str) -> Scene:
+        """Return the one scene that a word stands for. Raises SceneFileError for several; CatalogError for an unknown name."""
+        if len(self.names) > 1:
+            raise SceneFileError(f"--scene {word} stands for {len(self.names)} scenes: name one of them")
+        return self.built(self.names[0])
+
     def room_types(self) -> list[str]:
         """Return the type of each room of all scenes. Raises CatalogError for an unknown name."""
         catalog = Catalog.load()

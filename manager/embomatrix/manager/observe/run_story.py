@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final
 
 from embomatrix.manager.observe.run_totals import ENDS, working_s
@@ -104,7 +104,7 @@ def _learning(training: TrainingDetail | None) -> Iterator[str]:
         return
     phases = {curves.phase: curves for curves in training.phases}
     steps = ", ".join(
-        f"{_counted(max(curves.steps), 'step')} of {name.replace('grpo', 'GRPO')}"
+        f"{_counted(curves.last_step, 'step')} of {name.replace('grpo', 'GRPO')}"
         for name, curves in phases.items()
         if not name.startswith("success ") and curves.steps
     )
@@ -113,7 +113,7 @@ def _learning(training: TrainingDetail | None) -> Iterator[str]:
     if "grpo" in phases:
         yield from _ends(phases["grpo"])
     held_out = [phases.get(f"success {when} GRPO") for when in ("before", "after")]
-    values = [_latest(curves.figures.get("all", ())) if curves else None for curves in held_out]
+    values = [curves.latest("all", 1) if curves else None for curves in held_out]
     if None not in values:
         before, after = values
         yield f"Success on held-out tasks was {before:.0%} before GRPO and {after:.0%} after it."
@@ -128,10 +128,6 @@ def _ends(curves: Curves) -> Iterator[str]:
             first, last = sum(values[:ends]) / ends, sum(values[-ends:]) / ends
             where = "step" if ends == 1 else f"{ends} steps"
             yield f"{words} was {first:{style}} in the first {where} and {last:{style}} in the last."
-
-
-def _latest(values: Sequence[float | None]) -> float | None:
-    return next((value for value in reversed(values) if value is not None), None)
 
 
 def _clock(at_s: float) -> str:

@@ -1,11 +1,11 @@
 """Totals of a run as a list of named numbers, the same for every run, so that two runs can be compared."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from embomatrix.manager.observe.training_reports import Curves, TrainingDetail
+from embomatrix.manager.observe.training_reports import TrainingDetail
 from embomatrix.rpc.wire.run_log import PhaseSummary, RolloutPhase, RunSummary
 
 ENDS: Final = 10
@@ -57,10 +57,6 @@ def working_s(summary: RunSummary) -> float:
     return summary.series.step_s * sum(count > 0 for count in summary.series.completed)
 
 
-def mean_of(values: Sequence[float]) -> float | None:
-    return sum(values) / len(values) if values else None
-
-
 def _work(summary: RunSummary) -> Iterator[RunTotal]:
     stats, completed = summary.run.stats, sum(summary.series.completed)
     busy_s = working_s(summary)
@@ -94,20 +90,13 @@ def _learned(training: TrainingDetail | None) -> Iterator[RunTotal]:
     phases = {curves.phase: curves for curves in training.phases} if training is not None else {}
     grpo = phases.get("grpo")
     if grpo is not None:
-        yield RunTotal("GRPO steps", len(grpo.steps), TotalUnit.COUNT)
-        yield RunTotal("reward, latest steps", _latest(grpo, "reward"), TotalUnit.NUMBER, Aim.UP)
-        yield RunTotal("success, latest steps", _latest(grpo, "success"), TotalUnit.SHARE, Aim.UP)
+        yield RunTotal("GRPO steps", grpo.last_step, TotalUnit.COUNT)
+        yield RunTotal("reward, latest steps", grpo.latest("reward", ENDS), TotalUnit.NUMBER, Aim.UP)
+        yield RunTotal("success, latest steps", grpo.latest("success", ENDS), TotalUnit.SHARE, Aim.UP)
     for when in ("before", "after"):
         tested = phases.get(f"success {when} GRPO")
         if tested is not None:
-            yield RunTotal(
-                f"held-out success {when} GRPO", _latest(tested, "all", 1), TotalUnit.SHARE, Aim.UP
-            )
-
-
-def _latest(curves: Curves, name: str, steps: int = ENDS) -> float | None:
-    values = [value for value in curves.figures.get(name, ()) if value is not None]
-    return mean_of(values[-steps:])
+            yield RunTotal(f"held-out success {when} GRPO", tested.latest("all", 1), TotalUnit.SHARE, Aim.UP)
 
 
 def _share(part: float, whole: float) -> float | None:

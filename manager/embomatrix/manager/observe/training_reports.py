@@ -36,6 +36,16 @@ class Curves:
     steps: list[int]
     figures: dict[str, list[float | None]]
 
+    @property
+    def last_step(self) -> int:
+        """Number of the last reported step; 0 without any. A phase may report only some of its steps."""
+        return max(self.steps, default=0)
+
+    def latest(self, name: str, steps: int) -> float | None:
+        """Return the mean of the latest values of a figure, at most ``steps``; None without any."""
+        values = [value for value in self.figures.get(name, ()) if value is not None][-steps:]
+        return sum(values) / len(values) if values else None
+
 
 @dataclass(slots=True)
 class TrainingDetail:

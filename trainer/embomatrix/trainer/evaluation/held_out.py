@@ -25,7 +25,7 @@ from embomatrix.trainer.cluster.gateway import (
 )
 from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
 from embomatrix.trainer.evaluation.answers import Answer
-from embomatrix.trainer.evaluation.intervals import bootstrap, mean_over_tasks
+from embomatrix.trainer.evaluation.intervals import mean_over_tasks, paired_difference
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
@@ -84,9 +84,8 @@ class HeldOutEvaluation:
 
 def improvement(before: HeldOutEvaluation, after: HeldOutEvaluation) -> Interval:
     """Mean paired difference in success over the tasks in both evaluations."""
-    earlier = {score.task_id: score.rate for score in before.scores}
-    pairs = [score.rate - earlier[score.task_id] for score in after.scores if score.task_id in earlier]
-    return bootstrap(pairs)
+    earlier, later = ({score.task_id: score.rate for score in each.scores} for each in (before, after))
+    return paired_difference(earlier, later)
 
 
 def evaluate_policy(

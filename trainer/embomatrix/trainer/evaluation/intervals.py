@@ -1,7 +1,7 @@
 """Confidence intervals over tasks: samples of one task are not independent."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -43,6 +43,11 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
     means = known[draws].mean(axis=1)  # (resamples,)
     low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Interval(float(known.mean()), float(low), float(high))
+
+
+def paired_difference(before: Mapping[str, float], after: Mapping[str, float]) -> Interval:
+    """Mean of after minus before over the tasks in both, with a bootstrap over tasks. NaN rates are left out."""
+    return bootstrap([rate - before[task] for task, rate in after.items() if task in before])
 
 
 def mean_over_tasks(shares: Sequence[float]) -> Estimate:

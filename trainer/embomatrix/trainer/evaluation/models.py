@@ -13,7 +13,7 @@ from embomatrix.trainer.config.settings import (
     TrainSettings,
     read_settings,
 )
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, newest_checkpoint, read_state
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.loading import configure_torch, saved_policy
 from embomatrix.trainer.policy.protocol import Policy
@@ -30,7 +30,7 @@ def load_model(
     """
     folder = shipped_policy() if named == SHIPPED else Path(named)
     if (folder / CHECKPOINTS).is_dir():
-        folder = CheckpointStore(folder / CHECKPOINTS, keep=1).latest() or folder
+        folder = newest_checkpoint(folder) or folder
     if folder.is_dir() and (folder / "policy").is_dir():
         _, settings = read_state(folder)
         # A checkpoint holds the merged model, so the base model of its adapters is not needed.

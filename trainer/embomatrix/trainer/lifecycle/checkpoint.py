@@ -105,6 +105,11 @@ class CheckpointStore:
         )
 
 
+def newest_checkpoint(run: Path) -> Path | None:
+    """Return the folder of the newest complete checkpoint in a run's folder."""
+    return CheckpointStore(run / CHECKPOINTS, keep=1).latest()
+
+
 @contextlib.contextmanager
 def atomic_folder(final: Path) -> Iterator[Path]:
     """Yield an empty folder that is renamed to ``final`` at the end. On an error, nothing is left. Raises TrainerError."""

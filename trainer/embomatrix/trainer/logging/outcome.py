@@ -1,6 +1,7 @@
 """Machine-readable result of a finished run: one JSON file, written last, so its presence marks a finished run."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -49,6 +50,11 @@ class RunOutcome:
     def shares(self) -> TimeShares:
         """Time shares of the GRPO steps; NaN without steps."""
         return TimeShares(self.grpo_s, self.spent_s)
+
+
+def rates_by_task(rates: Iterable[TaskRate]) -> dict[str, float]:
+    """Return the success rates by task, without the tasks whose rollouts were all lost."""
+    return {rate.task_id: rate.rate for rate in rates if rate.rate is not None}
 
 
 def write_outcome(folder: Path, outcome: RunOutcome) -> None:

@@ -9,15 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.host.code_version import commit_here
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.evaluation.intervals import bootstrap, mean_over_tasks
-from embomatrix.trainer.lifecycle.checkpoint import (
-    CHECKPOINTS,
-    STATE,
-    CheckpointStore,
-    atomic_folder,
-    read_state,
-)
-from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, read_outcome
+from embomatrix.trainer.evaluation.intervals import mean_over_tasks, paired_difference
+from embomatrix.trainer.lifecycle.checkpoint import STATE, atomic_folder, newest_checkpoint, read_state
+from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, rates_by_task, read_outcome
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,7 +32,7 @@ def release(run: Path, out: Path, command: str) -> Path:
     if out.exists():
         raise TrainerError(f"{out} exists: give a new folder, or remove it")
     outcome = read_outcome(run)
-    newest = CheckpointStore(run / CHECKPOINTS, keep=1).latest()
+    newest = newest_checkpoint(run)
     if newest is None:
         raise TrainerError(f"{run} has no checkpoint: give the folder of a run, such as runs/demo")
     progress, settings = read_state(newest)
@@ -55,7 +49,7 @@ def card_of(
     outcome: RunOutcome, progress: TrainingProgress, settings: TrainSettings, command: str, day: str
 ) -> str:
     """Return the card as Markdown."""
-    gain = bootstrap(_differences(outcome.before, outcome.after))
+    gain = paired_difference(rates_by_task(outcome.before), rates_by_task(outcome.after))
     lines = [
         "# A small policy for household plans",
         "",
@@ -89,9 +83,3 @@ def _of(rates: Sequence[TaskRate], category: str) -> list[float]:
 
 def _success(rates: Sequence[float]) -> str:
     return mean_over_tasks(rates).interval.as_percent()
-
-
-def _differences(before: Sequence[TaskRate], after: Sequence[TaskRate]) -> list[float]:
-    earlier = {rate.task_id: rate.rate for rate in before}
-    pairs = ((earlier.get(rate.task_id), rate.rate) for rate in after)
-    return [later - first for first, later in pairs if first is not None and later is not None]

@@ -17,7 +17,12 @@ from embomatrix.trainer.config.settings import (
 )
 from embomatrix.trainer.data.tasks import TaskSet, load_tasks
 from embomatrix.trainer.data.variation import Variation
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
+from embomatrix.trainer.lifecycle.checkpoint import (
+    CHECKPOINTS,
+    TrainingProgress,
+    newest_checkpoint,
+    read_state,
+)
 from embomatrix.trainer.logging.evaluations import EVALUATIONS
 from embomatrix.trainer.logging.outcome import OUTCOME
 from embomatrix.trainer.logging.recorder import IMITATION, METRICS, SAMPLES
@@ -131,7 +136,7 @@ def resume_run(
 
     Raises TrainerError if there is none, or the tasks or unchangeable settings differ.
     """
-    newest = CheckpointStore(out / CHECKPOINTS, keep=1).latest()
+    newest = newest_checkpoint(out)
     if newest is None:
         raise TrainerError(
             f"no checkpoint in {out} to resume from: leave out --resume, or pass the run's --out"
@@ -182,4 +187,4 @@ def digest_of(tasks: TaskSet) -> str:
 
 def has_checkpoint(out: Path) -> bool:
     """True if the folder holds a run that can be resumed."""
-    return CheckpointStore(out / CHECKPOINTS, keep=1).latest() is not None
+    return newest_checkpoint(out) is not None

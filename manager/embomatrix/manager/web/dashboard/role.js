@@ -1,5 +1,5 @@
 // Role of the viewer's token. Commands that it may not send are disabled, with the reason.
-import {ask} from "./ask.js";
+import {Refused, ask, change} from "./ask.js";
 import {at, h, put} from "./dom.js";
 
 let known = null, owner = null, asking = null;
@@ -18,6 +18,18 @@ export async function learnRole() {
 
 /** Attributes of a button that sends a command. */
 export const command = (attributes = {}) => refusal() ? {...attributes, disabled: true, title: refusal(), "aria-describedby": "allowed"} : attributes;
+
+/** Send a command, show why it failed in the element "answer", and refresh the page after `ready`. */
+export async function steer(path, ready = () => {}) {
+  at("answer").textContent = "";
+  try {
+    await change(path);
+  } catch (error) {
+    at("answer").textContent = error instanceof Refused ? error.message : "the manager does not answer";
+  }
+  ready();
+  dispatchEvent(new Event("embomatrix-changed"));
+}
 
 /** Show the reason beside disabled buttons, with a way out, in the element "allowed". */
 export function showRefusal() {

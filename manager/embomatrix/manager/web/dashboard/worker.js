@@ -1,9 +1,9 @@
 // One worker: its state, its machine's CPU and memory in the last half hour, its last log lines, and its scenes.
-import {Refused, ask, change} from "./ask.js";
+import {Refused, ask} from "./ask.js";
 import {chart} from "./charts.js";
 import {at, count, h, none, put, seconds, share, table} from "./dom.js";
 import {named, worded} from "./names.js";
-import {command, learnRole, showRefusal} from "./role.js";
+import {command, learnRole, showRefusal, steer} from "./role.js";
 
 const LOOK_EVERY = 2, GONE = ["lost", "left"];
 /** Ticks at whole minutes of the day. */
@@ -62,7 +62,7 @@ function about(w) {
   const away = w.state === "draining", labels = Object.entries(w.labels).map(([key, value]) => `${key} ${value}`).join(", ");
   put(at("command"), GONE.includes(w.state) ? [] : h("button", command({type: "button"}), away ? "Resume" : "Drain"));
   const button = at("command").querySelector("button");
-  if (button) button.onclick = () => steer(`workers/${encodeURIComponent(name)}/${away ? "resume" : "drain"}`);
+  if (button) button.onclick = () => steer(`workers/${encodeURIComponent(name)}/${away ? "resume" : "drain"}`, () => { looks = 0; });
   showRefusal();
   const facts = [["state", [h("span", {class: `dot ${w.state}`}), w.state, w.reason && ` (${w.reason})`]], ["slots", `${w.busy} of ${w.slots} busy${w.waiting ? `, ${count(w.waiting)} rollouts wait behind them` : ""}`],
     ["completed", count(w.completed)], ["cores", count(w.cores)], ["memory for scenes", `${count(w.memory_used_mb)} of ${count(w.memory_mb)} MB`], ["GPU", w.gpu], ["labels", labels],
@@ -88,15 +88,4 @@ function machine(worker, host) {
 function scene(r) {
   return h("tr", {}, h("td", {class: "named"}, h("code", {title: r.bundle_digest}, named(r.bundle_digest))), h("td", {class: "fit"}, r.state),
     h("td", {class: "n", "data-name": "load time"}, r.load_s ? seconds(r.load_s) : ""), h("td", {class: "n", "data-name": "memory"}, r.memory_mb ? `${count(Math.round(r.memory_mb))} MB` : ""), h("td", {class: "message"}, worded(r.error)));
-}
-
-async function steer(path) {
-  at("answer").textContent = "";
-  try {
-    await change(path);
-  } catch (error) {
-    at("answer").textContent = error instanceof Refused ? error.message : "the manager does not answer";
-  }
-  looks = 0;
-  dispatchEvent(new Event("embomatrix-changed"));
 }

@@ -1,8 +1,7 @@
 // Workers: scenes, slots, state, machine, and the commands drain and resume. Each has a page of its own.
-import {Refused, change} from "./ask.js";
 import {asked, at, count, decoded, gauge, h, none, put, seconds, share, table} from "./dom.js";
 import {named, worded} from "./names.js";
-import {command, learnRole, refusal, showRefusal} from "./role.js";
+import {command, learnRole, refusal, showRefusal, steer} from "./role.js";
 
 const ROWS = 50, CHIPS = 6;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined", "left"];
@@ -102,15 +101,5 @@ function scenes(w) {
 
 function ask(changes) {
   Object.assign(filters, {offset: 0}, changes);
-  dispatchEvent(new Event("embomatrix-changed"));
-}
-
-async function steer(path) {
-  at("answer").textContent = "";
-  try {
-    await change(path);
-  } catch (error) {
-    at("answer").textContent = error instanceof Refused ? error.message : "the manager does not answer";
-  }
   dispatchEvent(new Event("embomatrix-changed"));
 }
