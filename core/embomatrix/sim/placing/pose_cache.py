@@ -21,6 +21,7 @@ from embomatrix.sim.geometry.candidates import (
 )
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
 from embomatrix.sim.geometry.surfaces import links_with_surfaces
+from embomatrix.sim.placing.grid import on_grid
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, Aabb, Pose
@@ -144,9 +145,15 @@ class PlacementLibrary:
             if self._mini.depth_m(pose) > TOLERANCE_M:
                 continue
             settled = self._mini.drop(pose)
-            if settled.stable and stands_in(held, back @ settled.pose, support, relation):
+            if not settled.stable:
+                continue
+            rest = back @ settled.pose
+            near = on_grid(rest)
+            if self._mini.depth_m(pose_world_support @ near) <= TOLERANCE_M:
+                rest = near
+            if stands_in(held, rest, support, relation):
                 found += 1
-                yield back @ settled.pose
+                yield rest
 
 
 def analyse_scene(engine: PhysicsEngine, library: PlacementLibrary, *, seed: int) -> PoseCache:

@@ -177,14 +177,16 @@ def discourse_forms(key: str) -> int:
 def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker) -> str:
     """Return the clause as a sentence of its own."""
     placed = clause.key in PLACED
+    leaves_choice = _LEAVES_CHOICE.match(clause.thing.words) is not None
     kinds = ["do", "do", "do"]
     if not clause.bare and not clause.key.endswith(TAP):
         kinds += ["done"] if _is_sourced(clause) else ["done", "state", "state"]
-        kinds += ["belongs"] * placed
+        # *Either the juice or the soda belongs on the table* sounds like a question of taste.
+        kinds += ["belongs"] * (placed and not leaves_choice)
         one_by_one = clause.thing.words.startswith(("each ", "every "))
         told_by_place = _HAS_PLACE.search(clause.thing.words) is not None
         kinds += ["moved", "moved"] * (
-            placed and bool(clause.whence) and not one_by_one and not told_by_place
+            placed and bool(clause.whence) and not (one_by_one or told_by_place or leaves_choice)
         )
     if clause.thing.words.startswith("any "):
         kinds = ["do"]  # *any book must be on the table* could mean every book
@@ -198,13 +200,11 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
         )
     if kind == "done":
         forms = book.forms("done")
-        if _LEAVES_CHOICE.match(clause.thing.words):
+        if leaves_choice:
             forms = tuple(form for form in forms if "waiting" not in form) or forms
         return _written(voice.choose(forms), {**fields, "done": _filled(voice.choose(passives), fields)})
     state = _filled(voice.choose(book.states(clause.key)), fields)
     forms = book.forms(kind)
-    if _LEAVES_CHOICE.match(clause.thing.words):
-        forms = tuple(form for form in forms if not form.startswith("The right place")) or forms
     if _HAS_PLACE.search(clause.thing.words):
         # *I want the milk in the fridge on the table* misleads; a verb must part thing and place.
         forms = tuple(form for form in forms if "{x} {state}" not in form) or forms
