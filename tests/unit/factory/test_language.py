@@ -163,6 +163,53 @@ def test_a_place_of_the_thing_and_a_place_to_put_it_are_kept_apart() -> None:
                 if "from the floor under" in text]  # fmt: skip
 
 
+def test_food_is_cooked_on_a_stove_and_in_an_oven() -> None:
+    book, steak = PhraseBook("heldout", 0), NounPhrase("the steak")
+    said = {
+        place: {imperative_of(Clause("cooked", steak, place), book, voice(seed)) for seed in range(60)}
+        for place in ("the stove", "the oven")
+    }
+    assert "cook the steak on the stove" in said["the stove"]
+    assert "cook the steak in the oven" in said["the oven"]
+    assert not any(" in the stove" in each for each in said["the stove"])
+
+
+def test_nothing_is_kept_inside_a_sink() -> None:
+    book = PhraseBook("heldout", 0)
+    clause = Clause("inside", NounPhrase("the mugs", 2), "the sink")
+    said = {sentence_of(clause, book, voice(seed), Speaker()) for seed in range(200)}
+    assert len(said) > 20
+    assert not any(
+        re.search(r"inside|[Ss]to(?:re|w)\b|[Pp]ack\b|[Tt]uck\b|put away", each) for each in said
+    ), said
+
+
+def test_a_place_is_told_once_in_a_statement() -> None:
+    book = PhraseBook("heldout", 0)
+    clause = Clause("ontop", NounPhrase("the book on the desk"), "the shelf")
+    said = {sentence_of(clause, book, voice(seed), Speaker()) for seed in range(200)}
+    assert not any(re.search(r"on the desk (?:should|must|ought|has) .*be on", each) for each in said), said
+    assert any("from the desk" in each for each in said)
+
+
+def test_the_only_bookcase_of_a_room_is_the_bookcase() -> None:
+    rows = [
+        PromptRow(0, "bookcase_1", "bookcase", "private_office_0", fixed=True),
+        PromptRow(1, "bookcase_2", "bookcase", "bedroom_0", fixed=True),
+        PromptRow(2, "key_1", "key", "private_office_0", "bookcase_1", Relation.ONTOP),
+        PromptRow(3, "key_2", "key", "bedroom_0", "bookcase_2", Relation.ONTOP),
+        PromptRow(4, "key_3", "key", "private_office_0"),
+    ]
+    said = {
+        Describer({row.name: row for row in rows}, ["private_office_0", "bedroom_0"], voice(seed)).definite(
+            ["key_1"]
+        )
+        for seed in range(40)
+    }
+    assert "the key on the bookcase in the private office" in said
+    assert not any("one of the bookcases in" in each for each in said), said
+
+
 def test_any_of_several_is_asked_for_and_never_stated() -> None:
     for text in sentences(Clause("ontop", NounPhrase("any book on the bookcase"), "the table")):
         assert not re.match("any ", text, re.IGNORECASE), (

@@ -15,11 +15,13 @@ from embomatrix.factory.writer.words import Voice
 FILE: Final = "phrases.toml"
 HELD_OUT_PHRASES: Final = 4
 """One in this many verbs, states and sentence forms belongs to the held-out split."""
-_LEAVES_CHOICE: Final = re.compile(r"(either|exactly|only|any|some|something|one|an?|all but)\b|\w+ of the\b")
+_LEAVES_CHOICE: Final = re.compile(
+    r"(either|exactly|only|just|any|some|something|one|an?|all but)\b|\w+ of the\b"
+)
 """Words for objects that may be chosen, which have no single right place."""
 _PARTICIPLES: Final[Mapping[str, str]] = {
     "put": "put", "set": "set", "lay": "laid", "leave": "left", "bring": "brought", "stand": "stood", "get": "got",
-    "drop": "dropped", "keep": "kept", "hide": "hidden", "take": "taken", "cut": "cut", "shut": "shut", "let": "left",
+    "drop": "dropped", "keep": "kept", "take": "taken", "cut": "cut", "shut": "shut", "let": "left",
     "run": "run", "have": "had", "wet": "wetted", "freeze": "frozen", "pick": "picked", "light": "lit", "scrub": "scrubbed",
     "stop": "stopped", "free": "freed",
     "transfer": "transferred", "throw": "thrown", "slide": "slid",
@@ -58,6 +60,12 @@ _HAS_PLACE: Final = re.compile(r" (?:on|in|under|with) ")
 """Prepositions in a noun phrase that tells a thing by its place."""
 _WHERE: Final = re.compile(r"(?<!cook) (?:on|in) (?=the |an? |one of |[a-z' ]+ \d)")
 """Preposition before the place of a thing; that of *something to cook in* is none."""
+_STOOD_ON: Final = re.compile(r"\b(?:stoves?|burners?|grills?|griddles?|tops?)\b")
+"""Appliances on which food is cooked; it is cooked in others."""
+_KEPT: Final = re.compile(r"(?:store|stow|pack|tuck|put \{x\} away) ")
+"""Verbs for what stays in its place, as nothing does in a sink."""
+_SINK: Final = re.compile(r"\bsinks?\b")
+"""Place in which things are, and not inside which."""
 _MOVING: Final = ("move ", "transfer ", "get ", "take ", "bring ")
 """Verbs that part a thing from its place: *move the mugs from the desk to the sink*, where *put* would heap up places."""
 _PARTICLE_FIRST: Final = re.compile(r"\w+ (?:on|off|up|down|out) \{x\}")
@@ -105,7 +113,6 @@ class Speaker:
                 "like": "would like",
                 "need": "need",
                 "count": "am counting",
-                "ask": "ask",
             }
         return {
             "I": self.name,
@@ -113,7 +120,6 @@ class Speaker:
             "like": "would like",
             "need": "needs",
             "count": "is counting",
-            "ask": "asks",
         }
 
 
@@ -178,18 +184,21 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
     """Return the clause as a sentence of its own."""
     placed = clause.key in PLACED
     leaves_choice = _LEAVES_CHOICE.match(clause.thing.words) is not None
+    told_by_place = _HAS_PLACE.search(clause.thing.words) is not None
     kinds = ["do", "do", "do"]
     if not clause.bare and not clause.key.endswith(TAP):
-        kinds += ["done"] if _is_sourced(clause) else ["done", "state", "state"]
-        # *Either the juice or the soda belongs on the table* sounds like a question of taste.
-        kinds += ["belongs"] * (placed and not leaves_choice)
+        # *The book on the desk should be on the shelf* sounds as if it were on both.
+        has_state = not _is_sourced(clause) and not (placed and told_by_place)
+        kinds += ["done", "state", "state"] if has_state else ["done"]
+        # *Either the juice or the soda belongs on the table* tells where things are kept, and asks for nothing.
+        kinds += ["belongs"] * (placed and not leaves_choice and not told_by_place)
         one_by_one = clause.thing.words.startswith(("each ", "every "))
-        told_by_place = _HAS_PLACE.search(clause.thing.words) is not None
         kinds += ["moved", "moved"] * (
             placed and bool(clause.whence) and not (one_by_one or told_by_place or leaves_choice)
         )
-    if clause.thing.words.startswith("any "):
-        kinds = ["do"]  # *any book must be on the table* could mean every book
+    if clause.thing.words.startswith("any ") or clause.place.startswith("each "):
+        # *Any book must be on the table* could mean every book, *a cup is on each saucer* one cup.
+        kinds = ["do"]
     kind = voice.choose(kinds)
     fields = _fields(clause, speaker)
     passives = [p for v in _verbs(clause, book) if (p := _passive(v)) is not None] if kind == "done" else []
@@ -200,15 +209,19 @@ def sentence_of(clause: Clause, book: PhraseBook, voice: Voice, speaker: Speaker
         )
     if kind == "done":
         forms = book.forms("done")
-        if leaves_choice:
-            forms = tuple(form for form in forms if "waiting" not in form) or forms
+        if told_by_place:
+            # *I want the meat on the counter cooked* could mean cooked on the counter.
+            forms = tuple(form for form in forms if "{x} {done}" not in form) or forms
         return _written(voice.choose(forms), {**fields, "done": _filled(voice.choose(passives), fields)})
-    state = _filled(voice.choose(book.states(clause.key)), fields)
+    states = book.states(clause.key)
+    if _SINK.search(clause.place):
+        states = tuple(each for each in states if "inside" not in each) or states
+    state = _filled(voice.choose(states), fields)
     forms = book.forms(kind)
-    if _HAS_PLACE.search(clause.thing.words):
+    if told_by_place:
         # *I want the milk in the fridge on the table* misleads; a verb must part thing and place.
         forms = tuple(form for form in forms if "{x} {state}" not in form) or forms
-    if clause.thing.words.startswith("all "):
+    if clause.thing.words.startswith(("all ", "both ")):
         # *All the drinks can't stay* could mean that some can.
         forms = tuple(form for form in forms if "can't" not in form) or forms
     it = {**fields, "x": clause.thing.it}
@@ -243,6 +256,8 @@ def _verbs(clause: Clause, book: PhraseBook) -> tuple[str, ...]:
         verbs = tuple(verb for verb in verbs if not verb.startswith("arrange")) or verbs
     if clause.place.startswith("the floor of "):
         verbs = tuple(verb for verb in verbs if "on top" not in verb) or verbs
+    if _SINK.search(clause.place):
+        verbs = tuple(verb for verb in verbs if not _KEPT.match(verb) and "inside" not in verb) or verbs
     if clause.key in PLACED and _WHERE.search(clause.thing.words):
         verbs = tuple(verb for verb in verbs if verb.startswith(_MOVING)) or verbs
     if clause.bare:
@@ -271,6 +286,7 @@ def _fields(clause: Clause, speaker: Speaker) -> dict[str, str]:
         "x": thing.words,
         "X": thing.words,
         "y": clause.place,
+        "at_y": f"{'on' if _STOOD_ON.search(clause.place) else 'in'} {clause.place}",
         "it": thing.it,
         "they": thing.subject_pronoun,
         "They": capitalised(thing.subject_pronoun),

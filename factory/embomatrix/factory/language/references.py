@@ -180,7 +180,15 @@ class Describer:
                     changes = {key: value for restriction in chosen for key, value in restriction.items()}
                     found = dataclasses.replace(head, **changes)
                     if not found.room or f"in {room_noun(found.room, self.rooms)}" not in found.host_words:
-                        yield found
+                        yield self._with_host_of_room(found)
+
+    def _with_host_of_room(self, description: Description) -> Description:
+        """Return the description with *the bookcase in the office* for *one of the bookcases*, if the room has only one."""
+        here = [name for name in description.hosts if name and self.rows[name].room == description.room]
+        if not description.room or len(description.hosts) < 2 or len(here) != 1:
+            return description
+        words = self.phrase(self._head(self.rows[here[0]].category), 1)
+        return dataclasses.replace(description, host_words=words)
 
     def _head(self, category: str) -> Description:
         """Return the noun of a category, which also fits objects with a longer noun: a coffee table is a table."""
@@ -249,9 +257,11 @@ def all_of(describer: Describer, description: Description, count: int) -> NounPh
         return _one(describer.phrase(description, 1), description)
     many = f"{number_word(count)} "
     options = [
-        ("the", 2), (f"the {number_word(count)}", 2), ("every", 1), ("all the", 2),
-        ("both" if count == 2 else f"all {many}", 2), ("each of the", 1),
+        ("the", 2), (f"the {number_word(count)}", 2), ("all the", 2),
+        ("both" if count == 2 else f"all {many}", 2), ("every", 1), ("each of the", 1),
     ]  # fmt: skip
+    if description.hosts or description.contents:
+        options = options[:4]  # *each of the pillows on one of the bookcases* is too much
     determiner, number = options[int(describer.voice.rng.integers(len(options)))]
     if determiner == "every" and (description.several or is_plural(description.noun.one)):
         determiner, number = "all the", 2  # there is no *every jeans*
@@ -282,7 +292,7 @@ def exactly(describer: Describer, description: Description, count: int, whole: i
     options = [
         describer.phrase(description, whole, f"exactly {word} of the"),
         describer.phrase(description, whole, f"{word} of the"),
-        describer.phrase(description, whole, f"only {word} of the"),
+        describer.phrase(description, whole, f"just {word} of the"),
     ]
     if count == whole - 1 and whole > 2:
         options += 2 * [describer.phrase(description, whole, "all but one of the")]

@@ -24,8 +24,7 @@ from embomatrix.factory.language.nouns import listed, noun_of, number_word
 from embomatrix.factory.language.references import Describer, Description, all_of, any_of, exactly, together
 from embomatrix.factory.social.day import NeedOfDay
 from embomatrix.factory.social.household import is_female
-from embomatrix.factory.social.knowledge import Event
-from embomatrix.factory.social.wish import PAIRS, PLACED, THERMAL, Condition, Quantity, WishPredicate
+from embomatrix.factory.social.wish import PAIRS, PLACED, Condition, Quantity, WishPredicate
 from embomatrix.factory.writer.words import Voice
 
 IMPLIED_SHARE: Final = 0.5
@@ -40,8 +39,8 @@ BEFORE_SHARE: Final = 0.2
 SAME_SHARE: Final = 0.6
 """Share of requests that only refer to the one before, if they ask for the same of other things."""
 _TAKES_NO_JOINT: Final = re.compile(
-    r"(In the end|When you|The same|And |Do the same|Likewise|Nobody has|Why |Here is what|How about)"
-    r"|.*( (is|are) still | can't stay | now and should be |too, please\.$|\?$)"
+    r"(The same|And |Do the same|Why |How about)"
+    r"|.*( (is|are) still | still (has|have) | can't stay |, but (it|they) should |too, please\.$|\?$)"
 )
 """Sentences that read badly after *first* or *finally*."""
 PRONOUNS: Final = ("She", "He")
@@ -52,7 +51,7 @@ _CHOICE: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _NAME: Final = re.compile(r"\{(\w+)\}")
 _INNER_PRONOUN: Final = re.compile(r"(?<=[\w,;:] )(?:He|She)\b")
 """Pronoun of a speaker inside a sentence."""
-_GREETINGS: Final = ("{name} here. ", "This is {name}. ", "It's {name}. ", "Hello, {name} speaking. ")
+_GREETINGS: Final = ("{name} here. ", "This is {name}. ", "It's {name}. ", "Hi, it's {name}. ")
 
 
 class UndescribableError(Exception):
@@ -104,7 +103,9 @@ class Teller:
             parts.append(self._joined(said, speaker.name, known=known, ends=number == len(groups) - 1))
             if event.before and self._rng() < BEFORE_SHARE:
                 parts.append(
-                    self._deadline(event, later, is_one=len(needs) == 1 and len(needs[0].conditions) == 1)
+                    self._deadline(
+                        needs[0].need, later, is_one=len(needs) == 1 and len(needs[0].conditions) == 1
+                    )
                 )
         text = _INNER_PRONOUN.sub(lambda match: match.group(0).lower(), " ".join(parts))
         return text if first.person.name in text else f"{first.person.name} says: {text}"
@@ -114,10 +115,10 @@ class Teller:
         why = self._personal(self.voice.choose(self.book.of_split("why", need.event.why)), need, speaker)
         return f"{self.voice.choose(self.book.joints('turn'))}{capitalised(why)}"
 
-    def _deadline(self, event: Event, speaker: Speaker, *, is_one: bool) -> str:
+    def _deadline(self, need: NeedOfDay, speaker: Speaker, *, is_one: bool) -> str:
         """Return a sentence about the time by which the requests are to be met."""
         words = self.voice.choose(self.book.joints("by one" if is_one else "by"))
-        before = self.voice.choose(event.before)
+        before = self._personal(self.voice.choose(need.event.before), need, speaker)
         return words.format(before=before, **speaker.fields())
 
     def reason(self, need: NeedOfDay) -> str:
@@ -138,8 +139,15 @@ class Teller:
                 sentence = f"{'She' if is_female(name) else 'He'}{sentence.removeprefix(name)}"
             known = known or (bool(name) and name in sentence)
             last = ends and number == len(said) - 1
-            kind = "first" if not number else "last" if last else "next"
-            takes_joint = is_request and len(said) > 1 and not _TAKES_NO_JOINT.match(sentence)
+            short = ends and len(said) == 2
+            kind = "first" if not number else "second" if short else "last" if last else "next"
+            # *First of all* and *finally* are too much for two requests.
+            takes_joint = (
+                is_request
+                and len(said) > 1
+                and not (short and not number)
+                and not _TAKES_NO_JOINT.match(sentence)
+            )
             joint = self.voice.choose(self.book.joints(kind)) if takes_joint else ""
             told.append(f"{joint}{_lowered(sentence, (name,))}" if joint else sentence)
         return " ".join(told)
@@ -328,8 +336,7 @@ class Teller:
             return self.describer.phrase(found, len(names), self.voice.choose(("different", "separate")))
         if len(names) == 1:
             return self.describer.phrase(found, 1)
-        kind = "any of the" if condition.predicate not in THERMAL else "one of the"
-        return self.describer.phrase(found, len(names), kind)
+        return self.describer.phrase(found, len(names), "one of the")
 
     def in_short(self, asked: Asked) -> list[str]:
         """Return the conditions as imperatives, for a dialogue. Raise UndescribableError."""
