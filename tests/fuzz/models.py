@@ -7,6 +7,7 @@ import functools
 import gzip
 import json
 import logging
+import lzma
 import random
 import struct
 from dataclasses import asdict
@@ -47,7 +48,6 @@ from embomatrix.factory.metrics.figures import (
     evaluation_to_json,
     read_evaluation,
 )
-from embomatrix.factory.pipeline.corpus import FROZEN_FILE, TASKS, VERIFIED, check_frozen
 from embomatrix.factory.pipeline.export import merge_in_words
 from embomatrix.factory.pipeline.merge import MERGED_FILE
 from embomatrix.factory.pipeline.store import (
@@ -73,7 +73,9 @@ from embomatrix.llm.ledger import Ledger, Price
 from embomatrix.llm.structured import read_json
 from embomatrix.llm.values import CassetteError, ChatRequest, Reply, Usage
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.world.dataset import TASKS_FILE, DatasetError
+from embomatrix.starter.archive import read_packed
+from embomatrix.starter.shipped import frozen_tasks
+from embomatrix.world.dataset import DatasetError
 
 # Language models
 
@@ -294,12 +296,12 @@ def _layout_outcomes(data: bytes) -> object:
     return outcome_log(in_file("outcomes.jsonl", data), 3).outcomes
 
 
+def _packed(data: bytes) -> object:
+    return read_packed(in_file("tasks.xz", lzma.compress(data)))[0]
+
+
 def _frozen(data: bytes) -> object:
-    line = record_line()
-    folder = in_file(f"corpus/{VERIFIED}/{FROZEN_FILE}", data).parents[1]
-    in_file(f"corpus/{VERIFIED}/{TASKS_FILE}", line.replace(b'"train"', b'"heldout"'))
-    in_file(f"corpus/{TASKS}/{TASKS_FILE}", line)
-    return check_frozen(folder)
+    return frozen_tasks(in_file("frozen.json", data))
 
 
 def table() -> dict[str, Decoder]:
@@ -367,7 +369,12 @@ def table() -> dict[str, Decoder]:
     variant = b'{"split": "train", "number": 0, "records": [' + record_line() + b'], "rejections": []}\n'
     outcome = LayoutOutcome("t", "Rs_int", LayoutMethod.TREE, True, True, False, "", 1.0, (0.5,), 6.0)
     layout = b'{"seed": 3}\n' + json.dumps(asdict(outcome)).encode()
-    frozen = b'{"tasks": 1, "unseen": 0, "scenes": ["tiny"], "digest": "sha256:0"}'
+    packed = (
+        b'{"sizes": [6], "records": ['
+        + record_line().replace(b'"sha256:' + b"0" * 64 + b'"', b"0")
+        + b"]}\nabcdef"
+    )
+    frozen = b'{"digest": "sha256:0", "tasks": ["a", "b"]}'
     return {
         "chat reply": Decoder(
             _chat_reply, (), lambda: (reply, b"[" * 5_000), frozenset({"llm.endpoint:_judged"}), mutate_json
@@ -510,11 +517,18 @@ def table() -> dict[str, Decoder]:
             frozenset({"factory.pipeline.export:merge_in_words"}),
             mutate_json,
         ),
-        "frozen corpus": Decoder(
+        "packed dataset": Decoder(
+            _packed,
+            (DatasetError,),
+            lambda: (packed,),
+            frozenset({"starter.archive:read_packed"}),
+            mutate_json_lines,
+        ),
+        "frozen tasks": Decoder(
             _frozen,
             (DatasetError,),
             lambda: (frozen,),
-            frozenset({"factory.pipeline.corpus:check_frozen"}),
+            frozenset({"starter.shipped:frozen_tasks"}),
             mutate_json,
         ),
     }

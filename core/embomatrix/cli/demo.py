@@ -13,8 +13,8 @@ from rich.logging import RichHandler
 
 from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, run_command
 from embomatrix.host.failure import fail
-from embomatrix.starter.archive import unpack
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
+from embomatrix.starter.shipped import unpack
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 
 DEFAULT_OUT: Final = Path("runs/demo")

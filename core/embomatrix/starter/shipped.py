@@ -1,20 +1,93 @@
-"""Places of what ships with the package: the tasks, unpacked once for each user, and a trained small policy."""
+"""Contents of the package besides code: parts of the corpus, the benchmark that is frozen from it, a small policy."""
 
 import hashlib
+import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Final
 
-from embomatrix.starter.archive import ARCHIVE, unpack
+from embomatrix.starter.archive import packed_records, read_packed
 from embomatrix.starter.options import DATASET_VARIABLE, default_dataset
-from embomatrix.world.dataset import TASKS_FILE
+from embomatrix.starter.recipes import PARTS
+from embomatrix.world.dataset import (
+    TASKS_FILE,
+    Dataset,
+    DatasetError,
+    TaskRecord,
+    encode_records,
+    record_to_json,
+    write_dataset,
+)
+from embomatrix.world.json_text import parse_json
 
 SHIPPED: Final = "shipped"
 """Name of the shipped policy, where a command takes a policy."""
+VERIFIED_FILE: Final = "internal-verified-2.json"
 _POLICY: Final = "policy"
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenTasks:
+    """Tasks of a frozen benchmark by id, and the digest of their records."""
+
+    digest: str
+    tasks: tuple[str, ...]
+
+
+def archive_of(part: int) -> Path:
+    """Return the file of a part of the corpus, which need not exist."""
+    return Path(str(resources.files("embomatrix.starter") / f"tasks-{part}.xz"))
+
+
+def shipped_parts() -> tuple[int, ...]:
+    """Return the numbers of the parts that ship."""
+    return tuple(part for part in PARTS if archive_of(part).exists())
+
+
+def unpack_part(folder: Path, part: int) -> str:
+    """Write a shipped part to a folder. Return its content digest. Raises DatasetError or OSError."""
+    records, bundles, digest = read_packed(archive_of(part))
+    write_dataset(folder, records, bundles)
+    return digest
+
+
+def unpack(folder: Path) -> str:
+    """Write all shipped parts to a folder as one dataset and return the digest of their digests.
+
+    Raises DatasetError or OSError.
+    """
+    everything: list[TaskRecord] = []
+    bundles: dict[str, bytes] = {}
+    digests = []
+    for part in shipped_parts():
+        records, contents, digest = read_packed(archive_of(part))
+        everything += records
+        bundles |= contents
+        digests.append(digest)
+    write_dataset(folder, everything, bundles)
+    return digest_of_parts(digests)
+
+
+def digest_of_parts(digests: Iterable[str]) -> str:
+    """Return the digest of a corpus from those of its parts."""
+    return f"sha256:{hashlib.sha256(' '.join(digests).encode('ascii')).hexdigest()}"
+
+
+def holds_shipped(folder: Path, parts: Iterable[int] | None = None) -> bool:
+    """Return True if a folder holds the records of these parts, by default of all. Bundles are not compared."""
+    try:
+        dataset = Dataset.load(folder)
+    except DatasetError:
+        return False
+    numbers = shipped_parts() if parts is None else parts
+    shipped = [record for part in numbers for record in packed_records(archive_of(part))]
+    found = json.loads(json.dumps([record_to_json(record) for record in dataset.records]))
+    return [{**value, "bundle": 0} for value in found] == [{**value, "bundle": 0} for value in shipped]
 
 
 def dataset_folder(named: Path | None) -> Path:
@@ -25,7 +98,29 @@ def dataset_folder(named: Path | None) -> Path:
     if named is not None:
         return named
     folder = default_dataset()
-    return folder if os.environ.get(DATASET_VARIABLE) or folder.exists() else _unpacked_tasks()
+    return folder if os.environ.get(DATASET_VARIABLE) or folder.exists() else unpacked_tasks()
+
+
+def verified_file() -> Path:
+    """Return the file of the tasks of Internal-Verified 2, which need not exist."""
+    return archive_of(1).with_name(VERIFIED_FILE)
+
+
+def frozen_tasks(path: Path) -> FrozenTasks:
+    """Return the tasks of a file that ``factory corpus --freeze`` wrote. Raises DatasetError."""
+    try:
+        value = parse_json(path.read_bytes())
+        return FrozenTasks(str(value["digest"]), tuple(map(str, value["tasks"])))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(
+            f"{path} names no frozen tasks ({error}): write it again with `embomatrix factory corpus --freeze`"
+        ) from error
+
+
+def frozen_digest(records: Iterable[TaskRecord]) -> str:
+    """Return the digest of records without their measured difficulties and the digests of their bundles."""
+    data = encode_records(replace(record, difficulty=None, bundle_digest="") for record in records)
+    return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
 def shipped_policy() -> Path:
@@ -33,10 +128,15 @@ def shipped_policy() -> Path:
     return Path(str(resources.files("embomatrix.starter") / _POLICY))
 
 
-def _unpacked_tasks() -> Path:
-    """Return the folder of the shipped tasks in the user's cache, and unpack them there if they are missing."""
-    archive = (resources.files("embomatrix.starter") / ARCHIVE).read_bytes()
-    folder = _cache() / f"tasks-{hashlib.sha256(archive).hexdigest()[:12]}"
+def unpacked_tasks() -> Path:
+    """Return the folder of the shipped tasks in the user's cache, and unpack them there if they are missing.
+
+    Raise DatasetError or OSError.
+    """
+    hashed = hashlib.sha256()
+    for part in shipped_parts():
+        hashed.update(archive_of(part).read_bytes())
+    folder = _cache() / f"tasks-{hashed.hexdigest()[:12]}"
     if not (folder / TASKS_FILE).exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
         # Two commands may unpack at once; a command that is interrupted leaves no half dataset.

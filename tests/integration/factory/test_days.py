@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import re
 import zlib
 from collections import Counter
 from pathlib import Path
+from typing import Never
 
 import numpy as np
 import pytest
 
+from embomatrix.factory.days import maker as days_maker
 from embomatrix.factory.days.laying import LaidOut, lay_out
 from embomatrix.factory.days.maker import DAYS, DayMaker
 from embomatrix.factory.days.planning import PlannedDay, need_weights, plan_day
+from embomatrix.factory.days.proofs import DayProofs
+from embomatrix.factory.language import clauses
 from embomatrix.factory.language.kinds import is_held_out
 from embomatrix.factory.pipeline.build import build_dataset, split_scenes
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
@@ -25,8 +31,9 @@ from embomatrix.factory.social.knowledge import Need, events
 from embomatrix.factory.social.values import Cast
 from embomatrix.factory.social.wish import problem_of
 from embomatrix.factory.writer.tasks import Draft
+from embomatrix.starter.archive import pack
 from embomatrix.world.bddl import parse_problem, render_problem
-from embomatrix.world.dataset import Dataset
+from embomatrix.world.dataset import Dataset, write_dataset
 from embomatrix.world.evaluate import ground_size
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
@@ -146,6 +153,49 @@ def test_a_day_depends_only_on_settings_and_order() -> None:
     for record in one.result.records:
         assert record.signature
         assert one.transcripts[record.task.task_id].startswith(f"# {record.task.instruction}")
+
+
+def test_tasks_that_differ_only_in_words_keep_their_proofs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = BuildSettings(look_ahead=False, physical=False, writer=WriterKind.SOCIAL)
+    base = build_base_scene("Pomaria_1_int")
+    rooms = tuple(room.name for room in base.rooms)
+    order = VariantOrder("train", 3, "Pomaria_1_int", rooms, dict.fromkeys(TaskCategory, 10), frozenset())
+    with contextlib.closing(DayMaker(settings)) as maker:
+        earlier = maker.make(order)
+        records = earlier.result.records
+        write_dataset(tmp_path, records, {records[0].bundle_digest: earlier.bundle})
+        words = dict(clauses._phrases())
+        words["forms"] = {**words["forms"], "do": ["Be an angel and {do}."]}
+        monkeypatch.setattr(clauses, "_phrases", lambda: words)
+        anew = maker.make(order)
+
+    def not_called(*_: object) -> Never:
+        raise AssertionError("a task was proved again")
+
+    monkeypatch.setattr(days_maker, "prove", not_called)
+    with contextlib.closing(DayMaker(settings, proofs=tmp_path)) as maker:
+        retold = maker.make(order)
+    assert retold.result.records == anew.result.records
+    assert retold.result.records != records
+    assert any("Be an angel" in record.task.instruction for record in retold.result.records)
+    assert (retold.bundle, retold.transcripts) == (anew.bundle, anew.transcripts)
+
+    planned = plan_day(order, base, 0)
+    assert isinstance(planned, PlannedDay)
+    pack(Dataset.load(tmp_path), tmp_path / "packed.xz")
+    proofs = DayProofs(tmp_path / "packed.xz")
+    again = proofs.retold(planned, order)
+    assert again is not None
+    assert again.result.records == retold.result.records
+    moved = dataclasses.replace(planned.scene, seed=planned.scene.seed + 1)
+    assert proofs.retold(dataclasses.replace(planned, scene=moved), order) is None, "another scene"
+    assert proofs.retold(dataclasses.replace(planned, tasks=planned.tasks[1:]), order) is None
+    other = dataclasses.replace(order, number=4)
+    elsewhere = plan_day(other, base, 0)
+    assert isinstance(elsewhere, PlannedDay)
+    assert proofs.retold(elsewhere, other) is None, "a day without proofs"
 
 
 def test_held_out_scenes_are_others_than_those_of_training(bases: dict[str, Scene]) -> None:

@@ -10,6 +10,7 @@ from tests.fakes.chat_server import ChatServer, completion
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.executors import HereExecutor
 
+from embomatrix.factory.pipeline.corpus import freeze
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
@@ -24,7 +25,7 @@ from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
 from embomatrix.worker.slots.rollout_pool import RolloutPool
-from embomatrix.world.dataset import Dataset
+from embomatrix.world.dataset import Dataset, write_dataset
 from embomatrix.world.difficulty import Difficulty
 from embomatrix.world.task import Profile
 
@@ -122,6 +123,33 @@ def test_scripts_write_executable_plans_for_tasks_that_they_never_saw(bench, nam
     found, _ = judged(bench, answers)
     assert len(found.plans) == len(bench.records)
     assert not any(verdict.lost for verdict in found.verdicts)
+
+
+def test_frozen_tasks_are_found_by_name_once_they_ship(tmp_path, monkeypatch):
+    folder = write_kitchen_dataset(tmp_path / "kitchen")
+    records = [replace(record, split="heldout") for record in Dataset.load(folder).records]
+    write_dataset(folder, records, {})
+    file = tmp_path / "frozen.json"
+    module = "embomatrix.trainer.evaluation.benchmark"
+    monkeypatch.setattr(f"{module}.verified_file", lambda: file)
+    monkeypatch.setattr(f"{module}.unpacked_tasks", lambda: folder)
+    with pytest.raises(TrainerError, match="does not ship with this version: pass a dataset folder"):
+        find_benchmark("internal-verified-2")
+    frozen = freeze(records, 2, file)
+    found = find_benchmark("internal-verified-2")
+    assert tuple(record.task.task_id for record in found.records) == frozen.tasks
+    assert found.training.records == tuple(records)
+    with pytest.raises(
+        TrainerError, match="all tasks of internal-verified-2 are held out, found --split train"
+    ):
+        find_benchmark("internal-verified-2", "train")
+    other = replace(records[0].task, instruction="Do something else.")
+    changed = [replace(records[0], task=other), *records[1:]]
+    freeze(changed, len(changed), file)
+    with pytest.raises(
+        TrainerError, match=r"have the digest sha256:.*, expected sha256:.*: remove the folder"
+    ):
+        find_benchmark("internal-verified-2")
 
 
 def test_scripts_need_training_tasks(bench):

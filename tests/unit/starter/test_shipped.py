@@ -1,4 +1,4 @@
-"""Choice of the dataset that a command uses, and unpacking of the shipped tasks."""
+"""Choice of the dataset that a command uses, unpacking of the shipped tasks, and what ships."""
 
 from pathlib import Path
 
@@ -6,7 +6,11 @@ import pytest
 
 from embomatrix.starter import shipped
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
-from embomatrix.world.dataset import TASKS_FILE
+from embomatrix.starter.recipes import PARTS
+from embomatrix.starter.shipped import frozen_tasks, holds_shipped, shipped_parts, unpack, verified_file
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
+from embomatrix.world.difficulty import DifficultyLevel
 
 
 @pytest.fixture
@@ -49,3 +53,59 @@ def test_shipped_tasks_are_unpacked_once_and_again_if_they_are_incomplete(
     assert (shipped.dataset_folder(None) / TASKS_FILE).exists()
     assert len(unpacked) == 2
     assert [each.name for each in folder.parent.iterdir()] == [folder.name]
+
+
+@pytest.fixture(scope="module")
+def tasks(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """The shipped tasks."""
+    folder = tmp_path_factory.mktemp("tasks")
+    unpack(folder)
+    return Dataset.load(folder)
+
+
+def test_shipped_parts_have_the_tasks_of_their_recipes_in_scenes_of_their_own(tasks: Dataset) -> None:
+    recipes = [PARTS[part] for part in shipped_parts()]
+    assert len(tasks.train) == sum(recipe.train for recipe in recipes)
+    assert len(tasks.heldout) == sum(recipe.heldout for recipe in recipes)
+    scenes = {
+        split: {record.task.scene_id.partition("-")[0] for record in records}
+        for split, records in (("train", tasks.train), ("heldout", tasks.heldout))
+    }
+    assert not scenes["train"] & scenes["heldout"]
+    assert len(scenes["train"]) >= 10
+    assert len({record.task.task_id for record in tasks.records}) == len(tasks.records)
+    assert all(record.difficulty is not None for record in tasks.records)
+    for record in tasks.records[::10]:
+        assert record.task.task_id in tasks.read_bundle(record.bundle_digest).tasks
+
+
+def test_recipes_make_2000_training_and_200_held_out_tasks_in_all_scenes() -> None:
+    scenes = [scene for recipe in PARTS.values() for scene in recipe.scenes]
+    assert sorted(scenes) == sorted(Catalog.load().scene_ids)
+    assert sum(recipe.train for recipe in PARTS.values()) == 2_000
+    assert sum(recipe.heldout for recipe in PARTS.values()) == 200
+
+
+def test_a_folder_with_the_shipped_tasks_is_recognised(tasks: Dataset, tmp_path: Path) -> None:
+    assert holds_shipped(tasks.folder)
+    write_dataset(tmp_path / "less", tasks.records[1:], {})
+    assert not holds_shipped(tmp_path / "less")
+    assert not holds_shipped(tmp_path)
+
+
+@pytest.mark.skipif(not verified_file().exists(), reason="the frozen tasks ship with part 2 of the corpus")
+def test_frozen_tasks_are_the_hardest_held_out_ones(tasks: Dataset) -> None:
+    frozen = frozen_tasks(verified_file())
+    chosen = [record for record in tasks.heldout if record.task.task_id in set(frozen.tasks)]
+    left = [record for record in tasks.heldout if record.task.task_id not in set(frozen.tasks)]
+    assert len(chosen) == len(frozen.tasks) == 100
+    assert frozen.digest == shipped.frozen_digest(chosen)
+    ranks = list(DifficultyLevel)
+    easiest = min(ranks.index(record.difficulty.level) for record in chosen if record.difficulty)
+    assert easiest >= max(ranks.index(record.difficulty.level) for record in left if record.difficulty)
+
+
+def test_damaged_list_of_frozen_tasks_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "frozen.json").write_text("[]")
+    with pytest.raises(DatasetError, match=r"frozen\.json names no frozen tasks .*: write it again"):
+        frozen_tasks(tmp_path / "frozen.json")

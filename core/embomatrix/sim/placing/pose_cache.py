@@ -21,7 +21,7 @@ from embomatrix.sim.geometry.candidates import (
 )
 from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
 from embomatrix.sim.geometry.surfaces import links_with_surfaces
-from embomatrix.sim.placing.grid import on_grid
+from embomatrix.sim.placing.snapping import snapped
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Asset
 from embomatrix.world.geometry import IDENTITY, Aabb, Pose
@@ -148,7 +148,7 @@ class PlacementLibrary:
             if not settled.stable:
                 continue
             rest = back @ settled.pose
-            near = on_grid(rest)
+            near = snapped(rest)
             if self._mini.depth_m(pose_world_support @ near) <= TOLERANCE_M:
                 rest = near
             if stands_in(held, rest, support, relation):

@@ -105,11 +105,6 @@ def script_results(
         return run_scripts(dataset, records, plans, jobs=processes(jobs), progress=count)
 
 
-def measured_records(dataset: Dataset, jobs: int | None) -> list[TaskRecord]:
-    """Return a dataset's records with their difficulty, by scripts that learned from its training tasks."""
-    return with_scripts(dataset.records, script_results(dataset, dataset.records, dataset, jobs))
-
-
 def _print_levels(records: Sequence[TaskRecord]) -> None:
     """Print the number of tasks of each level by split."""
     counts = level_counts(records)

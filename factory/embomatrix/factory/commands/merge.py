@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from embomatrix.factory.commands.terminal import say, user_errors
+from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.pipeline.merge import Resolution, conflict_counts, merge_datasets
 
 
@@ -21,6 +21,8 @@ def merge(
     ] = Resolution.REFUSE,
 ) -> None:
     """Merge datasets into a new one. Held-out tasks of one must not occur in the training split of another."""
+    if len(folders) < 2:
+        fail("found 1 dataset to merge: expected two or more folders")
     with user_errors(out):
         done = merge_datasets(folders, out, resolve)
     train = sum(record.split == "train" for record in done.records)

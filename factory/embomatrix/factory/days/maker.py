@@ -7,11 +7,13 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
 from embomatrix.factory.admission import SEED, RefusalReason, TaskRefusal
 from embomatrix.factory.days.planning import MOST_ALIKE, PlanDay, PlannedDay, day_name, plan_day
+from embomatrix.factory.days.proofs import DayProofs
 from embomatrix.factory.pipeline.build import Making
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.store import Rejection, VariantResult, VariantYield
@@ -56,7 +58,8 @@ SPATIAL: Final = frozenset(
 class DayMaker:
     """Maker of days in this process. A result depends only on the settings and the order. Close the maker after use.
 
-    ``plan`` replaces the rule-based planner of days. ``own`` are base scenes of files by name.
+    ``plan`` replaces the rule-based planner of days. ``own`` are base scenes of files by name. ``proofs`` is an earlier
+    build, as a folder or packed, whose tasks are proved already if only their words differ.
     """
 
     def __init__(
@@ -64,9 +67,12 @@ class DayMaker:
         settings: BuildSettings,
         plan: PlanDay = plan_day,
         own: Mapping[str, Scene] = MappingProxyType({}),
+        proofs: Path | None = None,
     ) -> None:
+        """Raise DatasetError if ``proofs`` holds no dataset."""
         self._settings = settings
         self._plan = plan
+        self._proofs = None if proofs is None else DayProofs(proofs)
         self._library = PlacementLibrary()
         self._foresight = ReachabilitySurvey() if settings.look_ahead else None
         self._bases: dict[str, Scene] = dict(own)
@@ -77,9 +83,15 @@ class DayMaker:
         if order.base not in self._bases:
             self._bases[order.base] = build_base_scene(order.base, seed=self._settings.seed)
         planned = self._plan(order, self._bases[order.base], self._settings.seed)
-        work = _DayWork(order, self._settings, self._library, self._foresight)
-        made = work.refused(planned) if isinstance(planned, TaskRefusal) else work.run(planned)
+        made = self._made(order, planned)
         return replace(made, cpu_s=time.process_time() - began)
+
+    def _made(self, order: VariantOrder, planned: PlannedDay | TaskRefusal) -> VariantYield:
+        work = _DayWork(order, self._settings, self._library, self._foresight)
+        if isinstance(planned, TaskRefusal):
+            return work.refused(planned)
+        retold = self._proofs.retold(planned, order) if self._proofs is not None else None
+        return retold or work.run(planned)
 
     def close(self) -> None:
         self._library.close()
@@ -93,6 +105,15 @@ DAYS: Final = Making(
     DayMaker, whole_scenes=True, tasks=TASKS_PER_DAY, most=MOST_OF_CATEGORY, alike=MOST_ALIKE
 )
 """Making of days in whole scenes."""
+
+
+def days_with_proofs(path: Path) -> Making:
+    """Return the making of days with the proofs of an earlier build: tasks that differ only in words are not proved again.
+
+    Raise DatasetError if there is no dataset, here rather than in a process of the build.
+    """
+    DayProofs(path)
+    return replace(DAYS, begin=partial(DayMaker, proofs=path))
 
 
 def days_planned_by(plan: PlanDay) -> Making:

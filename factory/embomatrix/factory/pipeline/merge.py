@@ -94,8 +94,6 @@ def merge_datasets(
     Exact duplicates are dropped. Raise DatasetError if two tasks differ and have one id, if a training task gives a
     held-out task of another dataset away and ``resolution`` says to refuse, or if the folder is not empty; OSError.
     """
-    if len(folders) < 2:
-        raise DatasetError(f"found {len(folders)} dataset to merge: expected two or more folders")
     if out.exists() and any(out.iterdir()):
         raise DatasetError(f"{out} is not empty: a merge overwrites nothing; name another folder with --out")
     datasets = [Dataset.load(folder) for folder in folders]

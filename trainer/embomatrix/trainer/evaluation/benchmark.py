@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
+from embomatrix.starter.shipped import frozen_digest, frozen_tasks, unpacked_tasks, verified_file
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import TrainingTask, read_tasks
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, record_to_json
@@ -19,11 +20,12 @@ ALL: Final = "all"
 IMPORT_REPORT: Final = "import.json"
 """Report of `embomatrix factory import --report` in the dataset's folder. Rejected problems count as failed."""
 NAMED: Final[Mapping[str, tuple[Path, str]]] = {
-    "internal-verified-2": (Path("build/corpus/internal-verified-2"), "embomatrix factory corpus"),
     "internal-verified": (Path("build/internal-verified"), "embomatrix factory"),
     "eai": (Path("build/eai"), "embomatrix factory import"),
 }
 """Benchmarks with the folders of their names, and the commands that create them."""
+VERIFIED: Final = "internal-verified-2"
+"""Benchmark that ships with the package: the hardest held-out tasks of the corpus."""
 
 
 @dataclass(frozen=True)
@@ -88,39 +90,65 @@ def find_benchmark(
     takes the first tasks only. With the profile ``PAPER``, tasks that need another household skill fail by rule. Raises
     TrainerError.
     """
+    if named == VERIFIED:
+        return _verified(split, limit, profile)
     path = NAMED[named][0] if named in NAMED else Path(named)
     if not path.exists():
-        remedy = f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join(NAMED)}"
+        remedy = f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join((VERIFIED, *NAMED))}"
         if named in NAMED:
             remedy = f"create it with `{NAMED[named][1]}`, or pass its folder"
         raise TrainerError(f"no benchmark at {path}: {remedy}")
     folder = path if path.is_dir() else path.parent
     records = _read_records(path)
     chosen, found_split = _select_split(records, split, path)
+    return _within(Benchmark(named, folder, found_split, chosen, _rejected(folder), records), limit, profile)
+
+
+def _verified(split: str, limit: int | None, profile: Profile) -> Benchmark:
+    """Return the frozen tasks. The training tasks are those that ship with them. Raises TrainerError."""
+    if split not in ("", "heldout"):
+        raise TrainerError(f"all tasks of {VERIFIED} are held out, found --split {split}: leave --split out")
+    if not verified_file().exists():
+        raise TrainerError(
+            f"{VERIFIED} does not ship with this version: pass a dataset folder, or install a newer version"
+        )
+    try:
+        folder = unpacked_tasks()
+        frozen, records = frozen_tasks(verified_file()), Dataset.load(folder).records
+    except (DatasetError, OSError) as error:
+        raise TrainerError(f"{VERIFIED} can't be read: {error}") from error
+    chosen = tuple(record for record in records if record.task.task_id in frozenset(frozen.tasks))
+    found = frozen_digest(chosen)
+    if found != frozen.digest:
+        raise TrainerError(
+            f"the tasks of {VERIFIED} in {folder} have the digest {found}, expected {frozen.digest}: remove the folder, so "
+            "that the shipped tasks are unpacked again"
+        )
+    return _within(Benchmark(VERIFIED, folder, "heldout", chosen, frozenset(), records), limit, profile)
+
+
+def _within(bench: Benchmark, limit: int | None, profile: Profile) -> Benchmark:
+    """Return the tasks that the profile's skills can solve; the others fail by rule. Raises TrainerError."""
+    chosen = bench.records
     within = [record for record in chosen if record.task.profile in (Profile.PAPER, profile)]
     inexpressible = {record.task.task_id for record in chosen} - {record.task.task_id for record in within}
     if not within:
         raise TrainerError(
-            f"no task of {path} can be solved with the skills of the profile {profile}: pass another --profile"
+            f"no task of {bench.folder} can be solved with the skills of the profile {profile}: pass another --profile"
         )
-    return Benchmark(
-        named,
-        folder,
-        found_split,
-        tuple(within[:limit]),
-        frozenset(inexpressible | _rejected(folder)),
-        records,
+    return replace(
+        bench, records=tuple(within[:limit]), failed_by_rule=bench.failed_by_rule | frozenset(inexpressible)
     )
 
 
-def _rejected(folder: Path) -> set[str]:
+def _rejected(folder: Path) -> frozenset[str]:
     """Names of the problems that an import rejected."""
     path = folder / IMPORT_REPORT
     try:
         outcomes = parse_json(path.read_bytes())["outcomes"]
-        return {str(outcome["name"]) for outcome in outcomes if outcome["reason"]}
+        return frozenset(str(outcome["name"]) for outcome in outcomes if outcome["reason"])
     except FileNotFoundError:
-        return set()
+        return frozenset()
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainerError(
             f"{path} is not an import report ({error!r}): create it again with `embomatrix factory import --report`"

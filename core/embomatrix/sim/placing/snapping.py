@@ -1,4 +1,4 @@
-"""Grid of stored poses: settled poses moved by less than half a millimetre, so that a dataset of them compresses well.
+"""Grid of stored poses: places move by less than 0.4 mm and rotations by at most 0.01 rad, so that a dataset compresses well.
 
 The lowest digits of a settled pose are noise of the simulator. Without them, the poses of a dataset take a third of the bytes.
 """
@@ -26,8 +26,8 @@ _QUARTERS: Final = (
 """Quaternions of rotations by multiples of a quarter turn about z."""
 
 
-def on_grid(pose: Pose) -> Pose:
-    """Return the pose of the grid next to a settled pose, at its height or above.
+def snapped(pose: Pose) -> Pose:
+    """Return the pose on the grid next to a settled pose, at its height or above.
 
     A pose that is nearly upright at a multiple of a quarter turn becomes exactly so. Others keep their rotation.
     """
