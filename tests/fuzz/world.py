@@ -21,6 +21,7 @@ from tests.fuzz.decoder import (
 )
 
 from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
+from embomatrix.factory.floorplan.procthor import house_file_of
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.scenes.scene_file import SceneFileError, read_scene
@@ -180,6 +181,15 @@ def _house(data: bytes) -> object:
     return house
 
 
+def _procthor(data: bytes) -> object:
+    return house_file_of(in_file("house.json", data), "house")
+
+
+PROCTHOR = (
+    b'{"rooms": [{"id": "room|1", "roomType": "Kitchen", "floorPolygon": [{"x": 0, "z": 0}, {"x": 0, "z": 4}, {"x": 4, "z": 4},'
+    b' {"x": 4, "z": 0}]}], "doors": [{"room0": "room|1", "room1": "room|1"}], "windows": [], "objects": [{"id": "Fridge|1|0",'
+    b' "position": {"x": 1, "y": 0.5, "z": 1}, "children": []}]}',
+)
 HOUSES = (
     b'scene = "flat"\ndoors = [{rooms = ["kitchen_0", "outside"], width_m = 1.0}, {rooms = ["bar_0", "kitchen_0"]}]\n'
     b"[rooms.kitchen_0]\nsize_m = [3.5, 3]\nwindows = 2\nfurniture = {fridge = 1, sofa-mnfbbh = 2}\n"
@@ -349,6 +359,13 @@ def table() -> dict[str, Decoder]:
             lambda: HOUSES,
             frozenset({"factory.toml_files:read_toml", "world.records:convert"}),
             mutate_bytes,
+        ),
+        "house of ProcTHOR": Decoder(
+            _procthor,
+            (HouseFileError,),
+            lambda: PROCTHOR,
+            frozenset({"factory.floorplan.procthor:house_file_of"}),
+            mutate_json,
         ),
         "task file": Decoder(
             _task_file,

@@ -1,6 +1,7 @@
 """``embomatrix scene``: build, list, show, draw and check base scenes."""
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from enum import StrEnum
@@ -15,6 +16,8 @@ from rich.console import Console
 from embomatrix.factory.commands.terminal import check_output, fail, progress, say, show_table, user_errors
 from embomatrix.factory.floorplan.house_file import SUFFIX as HOUSE_SUFFIX
 from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
+from embomatrix.factory.floorplan.procthor import MARK as HOUSE_MARK
+from embomatrix.factory.floorplan.procthor import house_file_of
 from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
@@ -167,6 +170,31 @@ def build(
             for sentence in done.left_out:
                 say(f"left out of {done.scene_id}: {sentence}")
     _print_reports(reports, report)
+
+
+@app.command("import")
+def import_house(
+    house: Annotated[Path, typer.Argument(help="JSON file of a house of ProcTHOR.")],
+    out: Annotated[Path | None, typer.Option(help="House file to write. Default: NAME.toml.")] = None,
+    name: Annotated[str, typer.Option(help="Name of the scene. Default: that of the file.")] = "",
+    force: Force = False,
+) -> None:
+    """Write a house of ProcTHOR as a floor plan for `scene build`: rooms, doors, windows, and counts of furniture."""
+    scene = re.sub(r"[^A-Za-z0-9_]+", "_", name or house.stem)[:40]
+    path = out or Path(f"{scene}{HOUSE_SUFFIX}")
+    keep_foreign("scene import", [path], HOUSE_MARK, force=force)
+    with _user_errors():
+        text, notes = house_file_of(house, scene)
+    with _user_errors(path):
+        write_whole(path, text.encode("utf-8"))
+    say(path)
+    for note in notes:
+        say(f"left out: {note}")
+    with _user_errors():
+        try:
+            read_house(path)
+        except HouseFileError as error:
+            fail(f"{error}; edit the file: the house of {house} does not fit our rules as it is")
 
 
 @app.command()
