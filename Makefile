@@ -92,6 +92,7 @@ pictures: $(VENV)/.dev
 	$(BIN)/embomatrix scene draw --all --as sheet --out docs/pictures --force
 	$(BIN)/embomatrix scene draw --as relations --format jpg --out docs/pictures --force
 	$(BIN)/embomatrix play Rs_int-train-000-03 --oracle --mode physical --film docs/pictures/physical.gif
+	$(BIN)/python deploy/site/skill_films.py docs/pictures/skills
 
 clean:
 	rm -rf build runs

@@ -94,7 +94,7 @@ def play(
         typer.Option(help="cached: pre-verified outcomes; physical: a robot in stepped physics."),
     ] = PlayMode.CACHED,
     film: Annotated[
-        Path | None, typer.Option(help="File for an animation of the plan: .gif, .webp or .png.")
+        Path | None, typer.Option(help="File for an animation of the plan: .gif, .webp, .png or .mp4.")
     ] = None,
 ) -> None:
     """Execute a plan in a task and print every step, the final state and the reward.

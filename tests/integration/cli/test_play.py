@@ -1,7 +1,9 @@
 """`embomatrix play` with valid, failing and unparsable plans."""
 
+import importlib.util
 import json
 
+import av
 import pytest
 import typer
 from PIL import Image
@@ -9,7 +11,7 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from typer.testing import CliRunner
 
 from embomatrix.cli.play import play
-from embomatrix.starter.archive import unpack
+from embomatrix.starter.shipped import unpack
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
@@ -224,10 +226,26 @@ def test_plan_is_drawn_as_an_animation(run, tmp_path):
         assert picture.size == (896, 480)
 
 
-def test_unknown_film_suffix_is_refused_before_execution(run):
-    result = run("apple_to_counter", "--oracle", "--film", "film.mp4")
+def test_plan_is_drawn_as_a_video(run, tmp_path, monkeypatch):
+    film = tmp_path / "film.mp4"
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(GOOD[:2]))
+    result = run("apple_to_counter", "--plan", str(plan), "--film", str(film))
+    assert result.exit_code == 0, result.output
+    with av.open(str(film)) as video:
+        (stream,) = video.streams
+        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 896, 480)
+        assert sum(1 for _ in video.decode(stream)) > 20
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    result = run("apple_to_counter", "--oracle", "--film", str(film))
     assert result.exit_code == 2
-    assert "film.mp4" in result.output
+    assert "pip install embomatrix[film]" in " ".join(result.output.split())
+
+
+def test_unknown_film_suffix_is_refused_before_execution(run):
+    result = run("apple_to_counter", "--oracle", "--film", "film.avi")
+    assert result.exit_code == 2
+    assert "film.avi" in result.output
     assert ".gif" in result.output
     assert "✓" not in result.output
 

@@ -1,8 +1,9 @@
 """Films of a plan: the robot's room, its camera view, and the plan as text, drawn in separate processes."""
 
+import importlib.util
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -24,11 +25,16 @@ LINES: Final = 15
 LINE_CHARACTERS: Final = 38
 COLORS: Final = 128
 """Size of a frame's palette: flat shading needs no more."""
+CLOSE_M: Final = 0.2
+"""Floor to each side of the robot in close pictures."""
 CHUNK: Final = 6
 """Frames that a process draws per request."""
 HOLD_MS: Final = 1500
 """Duration of the last frame."""
-SUFFIXES: Final = (".gif", ".webp", ".png")
+MP4: Final = ".mp4"
+SUFFIXES: Final = (".gif", ".webp", ".png", MP4)
+QUALITY: Final = "23"
+"""Constant rate factor of H.264, its usual value. Lower values give better pictures and larger files."""
 
 
 class FilmError(ValueError):
@@ -48,14 +54,16 @@ def draw_film(
     captions: Sequence[Caption],
     *,
     processes: int = 2,
+    close: bool = False,
     on_frame: Callable[[int, int], None] = lambda done, count: None,
 ) -> list[Image.Image]:
     """Pictures of all frames, RGB, 896 x 480 pixels: the room on the left, the robot's view and ``captions`` on the right.
 
     There is a caption for each call of the plan. Frames are drawn by processes that share nothing with this one.
-    ``on_frame`` is called with the number of drawn frames and of all frames.
+    If ``close``, the left picture shows the surroundings of the robot rather than whole rooms. ``on_frame`` is called with the
+    number of drawn frames and of all frames.
     """
-    rooms = _rooms_seen(film)
+    rooms = _surroundings(film) if close else _rooms_seen(film)
     chunks = [film.frames[start : start + CHUNK] for start in range(0, len(film.frames), CHUNK)]
     pictures: list[Image.Image] = []
     with process_pool(processes, _open_stage, film.scene, rooms) as pool:
@@ -67,15 +75,36 @@ def draw_film(
 
 
 def write_film(path: Path, pictures: Sequence[Image.Image]) -> None:
-    """Write an animation as GIF, WebP or PNG, by the file's suffix. Raises FilmError for another suffix."""
+    """Write an animation as GIF, WebP, PNG or MP4, by the file's suffix. Raises FilmError for another suffix."""
     check_suffix(path)
+    if path.suffix == MP4:
+        _write_mp4(path, pictures)
+        return
     frames = [picture.quantize(COLORS) for picture in pictures] if path.suffix == ".gif" else [*pictures]
     durations = [round(1000 / FRAMES_PER_S)] * (len(frames) - 1) + [HOLD_MS]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
+def _write_mp4(path: Path, pictures: Sequence[Image.Image]) -> None:
+    """Write H.264 that browsers and players show. The last picture stays for ``HOLD_MS``."""
+    import av  # PyAV, of the extra `film`
+
+    held = [pictures[-1]] * (HOLD_MS * FRAMES_PER_S // 1000)
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=FRAMES_PER_S, options={"crf": QUALITY})
+        stream.width, stream.height = pictures[0].size
+        stream.pix_fmt = "yuv420p"
+        for picture in (*pictures, *held):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(picture), format="rgb24")))
+        container.mux(stream.encode())
+
+
 def check_suffix(path: Path) -> None:
-    """Raise FilmError if the file's suffix is not that of a film."""
+    """Raise FilmError if the file's suffix is not that of a film, or needs a package that is missing."""
+    if path.suffix == MP4 and importlib.util.find_spec("av") is None:
+        raise FilmError(
+            f"{path.name!r} needs the package av: install it with `pip install embomatrix[film]`, or name a .gif file"
+        )
     if path.suffix not in SUFFIXES:
         raise FilmError(
             f"a film can't be written as {path.name!r}: expected a name that ends in {', '.join(SUFFIXES)}"
@@ -136,6 +165,18 @@ def _rooms_seen(film: Film) -> dict[int, tuple[Room, ...]]:
         names.setdefault(frame.step, set()).add(film.scene.room_at((frame.robot.x_m, frame.robot.y_m)))
     rooms = film.scene.rooms
     return {step: tuple(room for room in rooms if room.name in seen) or rooms for step, seen in names.items()}
+
+
+def _surroundings(film: Film) -> dict[int, tuple[Room, ...]]:
+    """Return for each step a part of the floor around the places of the robot, as a room."""
+    found: dict[int, tuple[Room, ...]] = {}
+    for step in {frame.step for frame in film.frames}:
+        robots = [frame.robot for frame in film.frames if frame.step == step]
+        xs, ys = [robot.x_m for robot in robots], [robot.y_m for robot in robots]
+        low = (min(xs) - CLOSE_M, min(ys) - CLOSE_M)
+        high = (max(xs) + CLOSE_M, max(ys) + CLOSE_M)
+        found[step] = (replace(film.scene.rooms[0], low_m=low, high_m=high),)
+    return found
 
 
 def _page(room: Image.Image, eye: Image.Image, captions: Sequence[Caption], step: int) -> Image.Image:
