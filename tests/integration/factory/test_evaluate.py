@@ -52,8 +52,9 @@ from embomatrix.factory.metrics.figures import (
     evaluation_to_json,
     read_evaluation,
 )
-from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, training_scenes
+from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.pages.figures import Better, Figure
+from embomatrix.starter.recipes import PARTS
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError
 
@@ -265,7 +266,7 @@ def test_drafts_of_a_scene_differ_and_depend_only_on_the_seed(flat):
 
 def test_training_and_held_out_scenes_partition_all_scenes():
     assert len(training_scenes()) == 45
-    assert {*training_scenes(), *HELDOUT_SCENES} == {*Catalog.load().scene_ids}
+    assert {*training_scenes(), *PARTS[2].scenes} == {*Catalog.load().scene_ids}
 
 
 EVALUATION = EvaluationFigures(

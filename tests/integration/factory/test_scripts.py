@@ -14,6 +14,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import build_variant
+from embomatrix.host.code_version import commit_here
 from embomatrix.scripts.calls import ScriptDemand
 from embomatrix.scripts.examples import ScriptExample
 from embomatrix.scripts.template import TemplateScript
@@ -136,7 +137,12 @@ def test_evaluate_writes_the_figures_of_scripts(kitchen, tmp_path) -> None:
     result = CliRunner().invoke(app, ["evaluate", "scripts", f"--dataset={kitchen}", f"--out={tmp_path}"])
     assert result.exit_code == 0, result.output
     value = json.loads((tmp_path / "scripts.json").read_text())
-    assert value["conditions"] == {"dataset": kitchen.name, "training tasks": 3, "held-out tasks": 1}
+    assert value["conditions"] == {
+        "dataset": kitchen.name,
+        "training tasks": 3,
+        "held-out tasks": 1,
+        "commit": commit_here(),
+    }
     assert [figure["name"] for figure in value["figures"]] == [f"{name}_success" for name in ScriptName]
 
 

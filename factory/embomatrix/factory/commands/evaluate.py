@@ -42,10 +42,11 @@ from embomatrix.factory.metrics.figures import (
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
 from embomatrix.factory.task_import.sources import SourceText
+from embomatrix.host.code_version import commit_here
 from embomatrix.host.own_files import Force, keep_foreign
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.starter.archive import unpack
+from embomatrix.starter.shipped import unpack
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
@@ -158,13 +159,18 @@ def evaluate(
         evaluations = []
         for part in parts:
             measured = part in measures
-            evaluations.append(measures[part]() if measured else read_evaluation(Path(part)))
+            evaluations.append(_with_commit(measures[part]()) if measured else read_evaluation(Path(part)))
             report_evaluation(evaluations[-1], out / f"{part}.json" if out and measured else None)
     if page is not None:
         with user_errors(page):
             before = page.read_text(encoding="utf-8") if page.exists() else ""
             write_whole(page, with_factory(before, evaluations).encode("utf-8"))
         say(f"page: {page}")
+
+
+def _with_commit(found: EvaluationFigures) -> EvaluationFigures:
+    """Return the figures with the commit of this code among their conditions."""
+    return replace(found, conditions={**found.conditions, "commit": commit_here()})
 
 
 def _given(path: Path | None, option: str) -> Path:
