@@ -26,6 +26,7 @@ from embomatrix.pages.head import page_head
 from embomatrix.world.dataset import DatasetError
 
 TASK = "apple_to_counter"
+SQUARE = ((0, 0), (0, 4), (4, 4), (4, 0))
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,6 @@ class Refusal:
 TASKS = "OUT/tasks.jsonl"
 REFUSALS = (
     Refusal("factory starter --out OUT", TASKS),
-    Refusal("factory starter --check --out OUT", TASKS),
-    Refusal("factory starter --check --out OUT", "OUT/shipped/tasks.jsonl"),
     Refusal("factory build --out OUT --train 1 --heldout 0 --scene Rs_int", TASKS),
     Refusal("factory generate --out OUT --tasks 1 --scene Rs_int", TASKS),
     Refusal("factory import --bddl one.bddl --scene Rs_int --out OUT", TASKS),
@@ -50,7 +49,10 @@ REFUSALS = (
     Refusal("factory difficulty --dataset OUT --out OUT/../OUT --easy-share 0.5", TASKS),
     Refusal("factory merge K K --out OUT", "OUT/notes.txt"),
     Refusal("factory corpus --out OUT", "OUT/tasks/notes.txt"),
-    Refusal("factory corpus --out OUT", "OUT/internal-verified-2/tasks.jsonl"),
+    Refusal("factory corpus --part 1 --out OUT", "OUT/parts/1/tasks.jsonl"),
+    Refusal("factory corpus --check --out OUT", "OUT/parts/1/tasks.jsonl"),
+    Refusal("factory corpus --part 2 --packed OUT", "OUT/tasks-2.xz"),
+    Refusal("factory corpus --part 2 --freeze OUT/frozen.json", "OUT/frozen.json"),
     Refusal(f"factory inspect {TASK} --dataset K", f"{TASK}.html"),
     Refusal("factory export --dataset K --out OUT/t.jsonl", "OUT/README.md"),
     Refusal("factory evaluate lies --out OUT", "OUT/lies.json"),
@@ -62,6 +64,7 @@ REFUSALS = (
     ),
     Refusal("factory try one.toml --out OUT", TASKS),
     Refusal("scene build Rs_int --out OUT", "OUT/Rs_int.json"),
+    Refusal("scene import house.json --out OUT/flat.toml", "OUT/flat.toml"),
     Refusal("scene draw --as relations --out OUT", "OUT/relations.png"),
     Refusal("model import-gguf K OUT", "OUT/config.json"),
     Refusal("model release K OUT", "OUT/notes.txt"),
@@ -105,6 +108,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "one.toml").write_text(
         'instruction = "i"\ngoal = "(open fridge_1)"\n[objects]\nfridge_1 = "inroom kitchen"\n'
     )
+    room = {"id": "room|1", "roomType": "Kitchen", "floorPolygon": [{"x": x, "z": z} for x, z in SQUARE]}
+    (tmp_path / "house.json").write_text(json.dumps({"rooms": [room]}))
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
     (tmp_path / "good.obj").write_text(f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     monkeypatch.chdir(tmp_path)
@@ -164,6 +169,7 @@ REPEATED = (
     f"factory inspect {TASK} --dataset K --no-picture",
     "factory import --bddl one.bddl --scene Rs_int --bind-only --report OUT/r.json",
     "factory lay --scene Rs_int --bddl one.bddl --out OUT",
+    "scene import house.json --out OUT/flat.toml",
     "factory assets draw --category apple",
     "factory assets import good.obj --category apple --creator me --licence MIT --cut components --out OUT",
     "worker install --folder OUT",
