@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 import selectors
 import traceback
@@ -15,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
+from unittest import mock
 
 import grpc
 from grpc.aio import AbortError
@@ -92,7 +94,11 @@ def run_in_order(main: Coroutine[Any, Any, T]) -> T:
 
     Sleeping takes no real time. ``sleep(0.001)`` returns when all other tasks wait for something.
     """
-    with asyncio.Runner(loop_factory=_Loop) as runner:
+    # The manager reads the clock itself, for example to count messages in a second.
+    with (
+        asyncio.Runner(loop_factory=_Loop) as runner,
+        mock.patch("time.monotonic", runner.get_loop().time),
+    ):
         return runner.run(main)
 
 
@@ -297,10 +303,12 @@ async def manager_inside(folder: Path) -> AsyncIterator[ManagerInside]:
     """Run a manager with bundles and archive in the folder while the context is held."""
     store = open_store("memory:")
     await store.claim(Candidate("inside", "inside:1", 3600.0))
-    # A fixed key, so that equal sequences of calls take equal decisions.
+    # Fixed keys and session ids, so that equal sequences of calls take equal decisions.
+    numbers = itertools.count(1)
+    registry = Registry(LivenessLimits(), new_id=lambda: f"{next(numbers):016x}")
     cluster = ClusterState(lease_key=b"rehearsal", audit_key=b"rehearsal")
     bundles = BundleStore(folder / "bundles", total_bytes=BUNDLE_BYTES)
-    runtime = ManagerRuntime(cluster, Registry(LivenessLimits()), store, bundles, RunArchive(folder / "runs"))
+    runtime = ManagerRuntime(cluster, registry, store, bundles, RunArchive(folder / "runs"))
     gate = Gate(store, guarded=True, shared_token=ADMIN)
     await runtime.start()
     await gate.open()
