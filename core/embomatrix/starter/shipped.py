@@ -49,11 +49,10 @@ def shipped_parts() -> tuple[int, ...]:
     return tuple(part for part in PARTS if archive_of(part).exists())
 
 
-def unpack_part(folder: Path, part: int) -> str:
-    """Write a shipped part to a folder. Return its content digest. Raises DatasetError or OSError."""
-    records, bundles, digest = read_packed(archive_of(part))
+def unpack_part(folder: Path, part: int) -> None:
+    """Write a shipped part to a folder. Raises DatasetError or OSError."""
+    records, bundles, _ = read_packed(archive_of(part))
     write_dataset(folder, records, bundles)
-    return digest
 
 
 def unpack(folder: Path) -> str:
@@ -70,11 +69,6 @@ def unpack(folder: Path) -> str:
         bundles |= contents
         digests.append(digest)
     write_dataset(folder, everything, bundles)
-    return digest_of_parts(digests)
-
-
-def digest_of_parts(digests: Iterable[str]) -> str:
-    """Return the digest of a corpus from those of its parts."""
     return f"sha256:{hashlib.sha256(' '.join(digests).encode('ascii')).hexdigest()}"
 
 

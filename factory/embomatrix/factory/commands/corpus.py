@@ -83,9 +83,9 @@ def corpus(
     if frozen is not None:
         _check_held_out(together, chosen, "--freeze")
         keep_foreign("factory corpus", [frozen], FROZEN_MARK, force=force)
+    making = DAYS if proofs is None else _with_proofs(proofs)
     with user_errors(out):
         check_free(out)
-        making = DAYS if proofs is None else days_with_proofs(proofs)
         built = [number for number in chosen if check or packed is not None or number not in shipped]
         for number in together:
             if number in built:
@@ -113,6 +113,14 @@ def corpus(
             say(f"part {number}: {len(found.records)} tasks, {digest}")
         if frozen is not None:
             say(f"Internal-Verified 2: {count} tasks, {freeze(records, count, frozen).digest}")
+
+
+def _with_proofs(proofs: Path) -> Making:
+    """Return the making of days with these proofs. Exit if they can't be read."""
+    try:
+        return days_with_proofs(proofs)
+    except (DatasetError, OSError) as error:
+        fail(f"name a dataset's folder or a packed part with --proofs: {error}")
 
 
 def _check_parts(chosen: Sequence[int], shipped: Sequence[int], *, check: bool) -> None:

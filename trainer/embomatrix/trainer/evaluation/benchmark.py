@@ -117,7 +117,8 @@ def _verified(split: str, limit: int | None, profile: Profile) -> Benchmark:
         frozen, records = frozen_tasks(verified_file()), Dataset.load(folder).records
     except (DatasetError, OSError) as error:
         raise TrainerError(f"{VERIFIED} can't be read: {error}") from error
-    chosen = tuple(record for record in records if record.task.task_id in frozenset(frozen.tasks))
+    named = frozenset(frozen.tasks)
+    chosen = tuple(record for record in records if record.task.task_id in named)
     found = frozen_digest(chosen)
     if found != frozen.digest:
         raise TrainerError(
