@@ -20,10 +20,9 @@ ALL: Final = "all"
 IMPORT_REPORT: Final = "import.json"
 """Report of `embomatrix factory import --report` in the dataset's folder. Rejected problems count as failed."""
 NAMED: Final[Mapping[str, tuple[Path, str]]] = {
-    "internal-verified": (Path("build/internal-verified"), "embomatrix factory"),
     "eai": (Path("build/eai"), "embomatrix factory import"),
 }
-"""Benchmarks with the folders of their names, and the commands that create them."""
+"""Benchmarks that a command creates, with their folders."""
 VERIFIED: Final = "internal-verified-2"
 """Benchmark that ships with the package: the hardest held-out tasks of the corpus."""
 
