@@ -251,6 +251,13 @@ def test_both_writers_are_measured_and_one_has_goals():
     assert all(figure.goal is None for figure in panel({"Rs_int": tasks}, {"Mia", "Hugo"}, "plain"))
 
 
+def test_goals_repeat_within_a_scene_only():
+    asked = DraftFeatures("Mia needs the fridge open.", "open(fridge)", ("kitchen_0",), False)
+    other = DraftFeatures("Mia wants to read: light, please.", "toggled_on(lamp)", ("kitchen_0",), False)
+    figures = panel({"Rs_int": [asked, other, asked, asked], "Merom_0_int": [asked]}, {"Mia"})
+    assert {figure.name: figure.value for figure in figures}["repeated_goal_rate"] == 2 / 5
+
+
 def test_people_are_read_from_transcripts(tmp_path):
     (tmp_path / "t.md").write_text(
         "# x\n\n* **Mia**, 40, nurse, likes chess\n* **Hugo**, 9, pupil\n\n**Mia** (need): x\n"

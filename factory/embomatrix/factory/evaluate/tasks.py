@@ -56,6 +56,7 @@ def panel(
     signs = [sign for asked in tasks for sign in _SIGN.findall(asked.signature)]
     things = [arguments.split(",") for _, arguments in signs]
     values |= {
+        "repeated_goal_rate": _share([again for group in groups.values() for again in _repeats(group)]),
         "predicate_entropy": evenness([predicate.strip() for predicate, _ in signs]),
         "object_entropy": evenness([each[0] for each in things]),
         "destination_entropy": evenness([each[1] for each in things if len(each) > 1]),
@@ -63,6 +64,12 @@ def panel(
         "quantified_share": _share([asked.quantified for asked in tasks]),
     }
     return tuple(_figure(name, value, n, label) for name, value in values.items())
+
+
+def _repeats(group: Sequence[DraftFeatures]) -> list[bool]:
+    """Tell of each task of a scene whether an earlier one asks for the same of the same kinds of things."""
+    signatures = [asked.signature for asked in group]
+    return [signature in signatures[:number] for number, signature in enumerate(signatures)]
 
 
 def evenness(values: Sequence[str]) -> float:
