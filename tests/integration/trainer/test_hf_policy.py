@@ -128,6 +128,63 @@ def test_layers_but_not_the_head_use_bfloat16_on_capable_cpus(
     assert not hasattr(model.get_output_embeddings(), "compute_dtype")
 
 
+def changed_share(policy, steps=6):
+    """Share of the weights that change in full fine-tuning with AdamW at a rate of 1e-5."""
+    prompt_ids = prompts(policy)
+    samples = policy.sample(prompt_ids, 2, 1.0, 10, torch.Generator().manual_seed(0))
+    before = [parameter.detach().clone() for parameter in policy.parameters()]
+    optimiser = torch.optim.AdamW(policy.parameters(), lr=1e-5, weight_decay=0.0)
+    for _ in range(steps):
+        optimiser.zero_grad()
+        (-policy.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0).logprobs.sum()).backward()
+        optimiser.step()
+    moved = touched = 0
+    for old, parameter in zip(before, policy.parameters(), strict=True):
+        learning = parameter.grad != 0  # rows of words that no prompt has stay as they are
+        touched += int(learning.sum())
+        moved += int(((parameter != old) & learning).sum())
+    return moved / touched
+
+
+def test_all_weights_learn_on_a_device_that_computes_in_bfloat16(policy, tmp_path):
+    policy.save(tmp_path)
+    # The CPU under another name than "cpu" is treated as a GPU is.
+    settings = TrainSettings(device="cpu:0")
+    stored_short = HfPolicy.load(tmp_path, settings, learns=False)
+    assert changed_share(stored_short) < 0.5
+    learning = saved_policy(tmp_path, settings)
+    assert {parameter.dtype for parameter in learning.parameters()} == {torch.float32}
+    assert changed_share(learning) > 0.99
+
+
+def test_automatic_mixed_precision_is_close_to_float32_and_keeps_samples_and_scores_equal(policy, tmp_path):
+    policy.save(tmp_path)
+    mixed = saved_policy(tmp_path, TrainSettings(device="cpu:0"))
+    prompt_ids = prompts(policy)
+    samples = mixed.sample(prompt_ids, 3, 1.2, 10, torch.Generator().manual_seed(0))
+    scored = mixed.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2)
+    apart = (
+        scored.logprobs - policy.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs
+    ).abs()
+    assert 0 < apart.max() < 0.1
+    assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=0.05)
+    exact = saved_policy(tmp_path, TrainSettings(device="cpu:0", compute_dtype="float32"))
+    assert torch.equal(
+        exact.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs,
+        policy.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs,
+    )
+
+
+def test_adapters_learn_beside_short_fixed_weights(policy, tmp_path):
+    policy.save(tmp_path)
+    lora = LoraSettings(rank=2, alpha=4.0)
+    adapted = HfPolicy.load(tmp_path, TrainSettings(device="cpu:0", lora=lora))
+    adapted.adapt(lora, seed=0)
+    assert {parameter.dtype for parameter in adapted.parameters()} == {torch.float32}
+    fixed = [parameter for parameter in adapted.module.parameters() if not parameter.requires_grad]
+    assert {parameter.dtype for parameter in fixed} == {torch.bfloat16}
+
+
 def test_adapters_learn_with_bfloat16_products(half, tmp_path):
     half.adapt(LoraSettings(rank=2, alpha=4.0), seed=0)
     prompt_ids = prompts(half)

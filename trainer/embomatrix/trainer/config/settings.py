@@ -63,9 +63,12 @@ class OptimiserKind(StrEnum):
 
 
 class ComputeDtype(StrEnum):
-    """Data type of the matrix products in linear layers on a CPU. Weights, sums and attention stay in float32."""
+    """Data type of the matrix products in linear layers. Weights that learn, their gradients and sums are in float32.
 
-    AUTO = "auto"  # bfloat16 if the CPU has instructions for it, else float32
+    On a CPU attention is in float32 too; on other devices torch's automatic mixed precision decides.
+    """
+
+    AUTO = "auto"  # bfloat16 on GPUs and on CPUs with instructions for it, else float32
     BFLOAT16 = "bfloat16"
     FLOAT32 = "float32"
 

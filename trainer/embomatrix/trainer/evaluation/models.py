@@ -36,11 +36,11 @@ def load_model(
         # A checkpoint holds the merged model, so the base model of its adapters is not needed.
         settings = settings.model_copy(update={"device": device, "lora": LoraSettings()})
         configure_torch(threads or settings.threads, device)
-        return saved_policy(folder / "policy", settings), settings
+        return saved_policy(folder / "policy", settings, learns=False), settings
     configure_torch(threads or torch.get_num_threads(), device)
     if folder.is_dir() and TinyPolicy.is_saved_in(folder):
         settings = read_settings(None, {"device": device})
-        return saved_policy(folder, settings), settings
+        return saved_policy(folder, settings, learns=False), settings
     if folder.is_dir() and not HfPolicy.is_saved_in(folder):
         raise TrainerError(
             f"{folder} is not a model: expected runs/NAME, one of its checkpoints (runs/NAME/checkpoints/step-000050), or a "
@@ -48,4 +48,4 @@ def load_model(
         )
     written = codec or HfPolicy.codec_in(folder) or Codec.JSON
     settings = read_settings(None, {"device": device, "codec": written}, LANGUAGE_MODEL_DEFAULTS)
-    return HfPolicy.load(named, settings), settings
+    return HfPolicy.load(named, settings, learns=False), settings

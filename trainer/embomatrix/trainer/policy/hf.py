@@ -19,7 +19,7 @@ from torch.utils.checkpoint import checkpoint
 
 from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.config.errors import TrainerError, reason_of
-from embomatrix.trainer.config.settings import LoraSettings, TrainSettings
+from embomatrix.trainer.config.settings import ComputeDtype, LoraSettings, TrainSettings
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
 from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
@@ -45,13 +45,22 @@ class HfPolicy:
     """Policy over a transformers model and tokenizer.
 
     ``gradient_checkpointing`` trades time for memory in the update: each layer is computed twice, and a group's prompt once
-    per plan.
+    per plan. ``autocast``: the data type of torch's automatic mixed precision, in which the model computes although its
+    weights are in float32.
     """
 
     def __init__(
-        self, model: Any, tokenizer: Any, codec: Codec, name: str, *, gradient_checkpointing: bool = False
+        self,
+        model: Any,
+        tokenizer: Any,
+        codec: Codec,
+        name: str,
+        *,
+        gradient_checkpointing: bool = False,
+        autocast: torch.dtype | None = None,
     ) -> None:
         self.name = name
+        self._autocast = autocast
         self.codec = codec
         self.module = model.eval()
         self._gradient_checkpointing = gradient_checkpointing
@@ -61,10 +70,14 @@ class HfPolicy:
         self._pad = self._end[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
 
     @classmethod
-    def load(cls, name: str | Path, settings: TrainSettings, *, label: str = "") -> HfPolicy:
+    def load(
+        cls, name: str | Path, settings: TrainSettings, *, label: str = "", learns: bool = True
+    ) -> HfPolicy:
         """Load a model by name or folder, without adapters. Raises TrainerError with a remedy.
 
-        On a CPU its linear layers multiply in the ``compute_dtype`` of the settings.
+        On a CPU its linear layers multiply in the ``compute_dtype`` of the settings. On another device weights that stay
+        fixed, because adapters learn or because the model is only evaluated (``learns`` is False), are bfloat16. Weights that
+        learn are float32 everywhere: a step of 1e-5 is lost in the 8 significant bits of a bfloat16.
         """
         device = settings.device
         try:
@@ -78,7 +91,8 @@ class HfPolicy:
             ) from error
         # Its progress bars would mix with ours.
         transformers_logging.disable_progress_bar()  # type: ignore[no-untyped-call]
-        dtype = torch.float32 if device == "cpu" else torch.bfloat16
+        all_learn = learns and not settings.lora.rank
+        dtype = torch.float32 if device == "cpu" or all_learn else torch.bfloat16
         try:
             tokenizer = AutoTokenizer.from_pretrained(str(name))
             model: Any = AutoModelForCausalLM.from_pretrained(str(name), dtype=dtype)
@@ -90,12 +104,14 @@ class HfPolicy:
         cast_to = torch_dtype(settings.compute_dtype, device)
         if cast_to is not dtype and device == "cpu":
             use_compute_dtype(model, cast_to, model.get_output_embeddings())
+        mixed = device != "cpu" and all_learn and settings.compute_dtype is not ComputeDtype.FLOAT32
         return cls(
             model,
             tokenizer,
             settings.codec,
             label or str(name),
             gradient_checkpointing=settings.gradient_checkpointing,
+            autocast=torch.bfloat16 if mixed else None,
         )
 
     def adapt(self, lora: LoraSettings, *, seed: int, saved: Path | None = None) -> None:
@@ -137,7 +153,7 @@ class HfPolicy:
         max_new: int,
         generator: torch.Generator,
     ) -> Samples:
-        with frozen_weights(self.module):
+        with frozen_weights(self.module), self._precision():
             cache, mask, scores = self._read(prompts, group)
             rows = scores.shape[0]
             lengths = mask.sum(dim=1)  # (rows,)
@@ -162,11 +178,18 @@ class HfPolicy:
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
     ) -> TokenScores:
         recompute = self._gradient_checkpointing and torch.is_grad_enabled()
-        scores = (self._scores_recomputed if recompute else self._scores)(prompts, tokens, group)
+        with self._precision():
+            scores = (self._scores_recomputed if recompute else self._scores)(prompts, tokens, group)
         distribution = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
         chosen = distribution.gather(-1, tokens[..., None])[..., 0]
         entropy = -(distribution.exp() * distribution).sum(dim=-1)
         return TokenScores(chosen * mask, entropy * mask)
+
+    def _precision(self) -> contextlib.AbstractContextManager[object]:
+        """Context in which the model computes. One context casts each weight once, for all passes in it."""
+        if self._autocast is None:
+            return contextlib.nullcontext()
+        return torch.autocast(self.module.device.type, dtype=self._autocast)
 
     def _scores(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
         """Scores (rows, T, V) of each token (rows, T). The prompt of a group runs once."""

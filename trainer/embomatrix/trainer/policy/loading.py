@@ -61,8 +61,11 @@ def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
     )
 
 
-def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
-    """Load a policy from a folder. Raises TrainerError if there is none, or it is damaged."""
+def saved_policy(folder: Path, settings: TrainSettings, *, learns: bool = True) -> Policy:
+    """Load a policy from a folder, to train it unless ``learns`` is False.
+
+    Raises TrainerError if there is none, or it is damaged.
+    """
     try:
         if TinyPolicy.is_saved_in(folder):
             compute_dtype = torch_dtype(settings.compute_dtype, settings.device)
@@ -74,7 +77,7 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
     if settings.lora.rank and has_adapters(folder):
         return _language_model(settings.model, settings, folder)
     if HfPolicy.is_saved_in(folder):
-        return HfPolicy.load(folder, settings, label=settings.model)
+        return HfPolicy.load(folder, settings, label=settings.model, learns=learns)
     raise TrainerError(
         f"no policy found in {folder}: pass a checkpoint folder such as runs/NAME/checkpoints/step-000050"
     )
