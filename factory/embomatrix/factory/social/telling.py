@@ -159,7 +159,10 @@ class Teller:
 
     def _leaves_choice(self, asked: Asked) -> bool:
         """True if a place may be any of several pieces of furniture, which sentences of needs don't provide for."""
-        return any(each.place and len(asked.members[each.place]) > 1 for each in asked.conditions)
+        return any(
+            each.place and len(asked.members[each.place]) > 1 and each.quantity not in PAIRS
+            for each in asked.conditions
+        )
 
     def _implied(self, asked: Asked, speaker: Speaker) -> str:
         options = self.book.of_split("say", asked.need.need.say)
@@ -176,7 +179,7 @@ class Teller:
         """Return words for all objects of a label, or for any one of them if the conditions leave the choice."""
         names = asked.members[label]
         is_free = any(each.things == label and each.quantity is Quantity.ANY for each in asked.conditions)
-        is_place = any(each.place == label for each in asked.conditions)
+        is_place = any(each.place == label and each.quantity not in PAIRS for each in asked.conditions)
         if len(names) == 1 or not (is_free or is_place):
             return self._definite(names)
         found = self._described(names)

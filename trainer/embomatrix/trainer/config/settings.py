@@ -65,10 +65,11 @@ class OptimiserKind(StrEnum):
 class ComputeDtype(StrEnum):
     """Data type of the matrix products in linear layers. Weights that learn, their gradients and sums are in float32.
 
-    On a CPU attention is in float32 too; on other devices torch's automatic mixed precision decides.
+    On a CPU attention and the output layer are in float32 too. On a GPU a language model computes in torch's automatic mixed
+    precision; the word-level policy stays in float32 with ``AUTO``.
     """
 
-    AUTO = "auto"  # bfloat16 on GPUs and on CPUs with instructions for it, else float32
+    AUTO = "auto"  # bfloat16 on CPUs with instructions for it and for language models on GPUs, else float32
     BFLOAT16 = "bfloat16"
     FLOAT32 = "float32"
 

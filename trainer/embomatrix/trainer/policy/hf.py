@@ -76,8 +76,9 @@ class HfPolicy:
         """Load a model by name or folder, without adapters. Raises TrainerError with a remedy.
 
         On a CPU its linear layers multiply in the ``compute_dtype`` of the settings. On another device weights that stay
-        fixed, because adapters learn or because the model is only evaluated (``learns`` is False), are bfloat16. Weights that
-        learn are float32 everywhere: a step of 1e-5 is lost in the 8 significant bits of a bfloat16.
+        fixed, because adapters learn or because the model is only evaluated (``learns`` is False), are bfloat16 unless
+        ``compute_dtype`` is float32. Weights that learn are float32 everywhere: a step of 1e-5 is lost in the 8 significant
+        bits of a bfloat16.
         """
         device = settings.device
         try:
@@ -92,7 +93,8 @@ class HfPolicy:
         # Its progress bars would mix with ours.
         transformers_logging.disable_progress_bar()  # type: ignore[no-untyped-call]
         all_learn = learns and not settings.lora.rank
-        dtype = torch.float32 if device == "cpu" or all_learn else torch.bfloat16
+        exact = settings.compute_dtype is ComputeDtype.FLOAT32
+        dtype = torch.float32 if device == "cpu" or all_learn or exact else torch.bfloat16
         try:
             tokenizer = AutoTokenizer.from_pretrained(str(name))
             model: Any = AutoModelForCausalLM.from_pretrained(str(name), dtype=dtype)
@@ -104,7 +106,7 @@ class HfPolicy:
         cast_to = torch_dtype(settings.compute_dtype, device)
         if cast_to is not dtype and device == "cpu":
             use_compute_dtype(model, cast_to, model.get_output_embeddings())
-        mixed = device != "cpu" and all_learn and settings.compute_dtype is not ComputeDtype.FLOAT32
+        mixed = device != "cpu" and all_learn and not exact
         return cls(
             model,
             tokenizer,
@@ -186,7 +188,7 @@ class HfPolicy:
         return TokenScores(chosen * mask, entropy * mask)
 
     def _precision(self) -> contextlib.AbstractContextManager[object]:
-        """Context in which the model computes. One context casts each weight once, for all passes in it."""
+        """Context in which the model computes. It casts each weight that learns once, for all passes in it."""
         if self._autocast is None:
             return contextlib.nullcontext()
         return torch.autocast(self.module.device.type, dtype=self._autocast)
