@@ -207,7 +207,22 @@ def test_the_only_bookcase_of_a_room_is_the_bookcase() -> None:
         for seed in range(40)
     }
     assert "the key on the bookcase in the private office" in said
-    assert not any("one of the bookcases in" in each for each in said), said
+    assert not any("a bookcase in" in each for each in said), said
+
+
+def test_one_of_several_bookcases_is_a_bookcase() -> None:
+    rows = [
+        PromptRow(0, "bookcase_1", "bookcase", "bedroom_0", fixed=True),
+        PromptRow(1, "bookcase_2", "bookcase", "bedroom_0", fixed=True),
+        PromptRow(2, "key_1", "key", "bedroom_0", "bookcase_1", Relation.ONTOP),
+        PromptRow(3, "key_2", "key", "bedroom_0"),
+    ]
+    told = {
+        Describer({row.name: row for row in rows}, ["bedroom_0"], voice(seed)).definite(["key_1"])
+        for seed in range(20)
+    }
+    assert "the key on a bookcase" in told
+    assert not any("one of the" in words for words in told)
 
 
 def test_any_of_several_is_asked_for_and_never_stated() -> None:

@@ -183,7 +183,7 @@ class Describer:
                         yield self._with_host_of_room(found)
 
     def _with_host_of_room(self, description: Description) -> Description:
-        """Return the description with *the bookcase in the office* for *one of the bookcases*, if the room has only one."""
+        """Return the description with *the bookcase in the office* for *a bookcase*, if the room has only one."""
         here = [name for name in description.hosts if name and self.rows[name].room == description.room]
         if not description.room or len(description.hosts) < 2 or len(here) != 1:
             return description
@@ -233,7 +233,10 @@ class Describer:
         yield {"contents": same, "contents_words": f"{words} {where} it"}
 
     def _host_words(self, host: str) -> Iterator[tuple[frozenset[str], str]]:
-        """Yield descriptions of a support by its noun, and by its noun and room, with all rows that they fit."""
+        """Yield descriptions of a support by its noun, and by its noun and room, with all rows that they fit.
+
+        One of several is *a bookcase*: *the mug on one of the bookcases* sounds as if the mug could be anywhere.
+        """
         row = self.rows.get(host)
         if row is None:
             return
@@ -243,7 +246,7 @@ class Describer:
             if len(found) == 1:
                 yield found, self.phrase(each, 1)
                 return
-            yield found, self.phrase(each, 2, "one of the")
+            yield found, with_article(self.phrase(each, 1, ""))
 
 
 FLOOR: Final = "floors"
@@ -261,7 +264,7 @@ def all_of(describer: Describer, description: Description, count: int) -> NounPh
         ("both" if count == 2 else f"all {many}", 2), ("every", 1), ("each of the", 1),
     ]  # fmt: skip
     if description.hosts or description.contents:
-        options = options[:4]  # *each of the pillows on one of the bookcases* is too much
+        options = options[:4]  # *each of the pillows on a bookcase* is too much
     determiner, number = options[int(describer.voice.rng.integers(len(options)))]
     if determiner == "every" and (description.several or is_plural(description.noun.one)):
         determiner, number = "all the", 2  # there is no *every jeans*
