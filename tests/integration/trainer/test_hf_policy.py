@@ -88,16 +88,20 @@ def half(policy, tokenizer):
     return HfPolicy(model, tokenizer, Codec.LINES, "random llama")
 
 
-def test_bfloat16_products_are_close_and_keep_float32_weights_and_gradients(policy, half):
+def near_float32(policy, other):
+    """Check that the other policy's scores are near those of the first and of its own samples. Return samples and scores."""
     prompt_ids = prompts(policy)
-    samples = half.sample(prompt_ids, 3, 1.2, 10, torch.Generator().manual_seed(0))
-    scored = half.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2)
-    apart = (
-        scored.logprobs - policy.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs
-    ).abs()
+    samples = other.sample(prompt_ids, 3, 1.2, 10, torch.Generator().manual_seed(0))
+    scored = other.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs
+    apart = (scored - policy.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs).abs()
     assert 0 < apart.max() < 0.1
-    assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=0.05)
-    scored.logprobs.sum().backward()
+    assert torch.allclose(scored, samples.logprobs * samples.mask, atol=0.05)
+    return samples, scored
+
+
+def test_bfloat16_products_are_close_and_keep_float32_weights_and_gradients(policy, half):
+    _, logprobs = near_float32(policy, half)
+    logprobs.sum().backward()
     assert {parameter.dtype for parameter in half.parameters()} == {torch.float32}
     assert {parameter.grad.dtype for parameter in half.parameters()} == {torch.float32}
 
@@ -160,14 +164,8 @@ def test_all_weights_learn_on_a_device_that_computes_in_bfloat16(policy, tmp_pat
 def test_automatic_mixed_precision_is_close_to_float32_and_scores_are_close_to_samples(policy, tmp_path):
     policy.save(tmp_path)
     mixed = saved_policy(tmp_path, TrainSettings(device="cpu:0"))
+    samples, _ = near_float32(policy, mixed)
     prompt_ids = prompts(policy)
-    samples = mixed.sample(prompt_ids, 3, 1.2, 10, torch.Generator().manual_seed(0))
-    scored = mixed.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2)
-    apart = (
-        scored.logprobs - policy.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs
-    ).abs()
-    assert 0 < apart.max() < 0.1
-    assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=0.05)
     exact = saved_policy(tmp_path, TrainSettings(device="cpu:0", compute_dtype="float32"))
     assert torch.equal(
         exact.logprobs(prompt_ids, samples.tokens, samples.mask, 3, 1.2).logprobs,
