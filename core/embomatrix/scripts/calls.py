@@ -162,7 +162,10 @@ class _CallWriter:
                 yield from self._soak(thing, demand.places)
 
     def _carry(self, item: PromptRow, place: PromptRow, relation: PlaceRelation) -> Iterator[SkillCall]:
-        if item.name == place.name or self._places[item.name] == (place.name, Relation(relation.value)):
+        if self._places[item.name] == (place.name, Relation(relation.value)):
+            return
+        # A misread sentence may ask for a thing on what it bears itself.
+        if item.name == place.name or item.name in self._bearers(place):
             return
         if relation is PlaceRelation.INSIDE:
             yield from self._open(place)
@@ -170,6 +173,13 @@ class _CallWriter:
         yield from self._move(place)
         yield SkillCall(Skill.PLACE, place.index, relation=relation)
         self._places[item.name] = (place.name, Relation(relation.value))
+
+    def _bearers(self, row: PromptRow) -> Iterator[str]:
+        """Yield the names of all that the object stands on, in or under, the nearest first."""
+        host, _ = self._places[row.name]
+        while host in self._rows:
+            yield host
+            host, _ = self._places[host]
 
     def _fetch(self, item: PromptRow) -> Iterator[SkillCall]:
         yield from self._uncover(item)
