@@ -36,7 +36,7 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "`embomatrix factory evaluate readings` judges answers of readers who saw prompts of held-out tasks only: the packaged "
         "ones to the shipped dataset, or `--answers FILE` to another `--dataset`. *human_success* is the share of their plans "
         "that succeed, *instruction_goal_agreement* the share of goals that equal the task's or are equivalent by execution. "
-        "The packaged answers are by four large language models, none by people.",
+        "The packaged answers are by seven instances of a large language model, none by people.",
     ),
     "admission": (
         "Admission",
