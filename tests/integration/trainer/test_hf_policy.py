@@ -80,6 +80,16 @@ def test_shared_prompt_gives_the_same_gradient(policy):
     assert torch.allclose(shared, gradient(rows[0] + rows[1]), atol=1e-4, rtol=1e-3)
 
 
+def test_entropy_has_a_graph_only_on_request(policy):
+    prompt_ids = prompts(policy)
+    samples = policy.sample(prompt_ids, 2, 1.0, 8, torch.Generator().manual_seed(0))
+    plain = policy.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0)
+    learning = policy.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0, entropy_gradient=True)
+    assert not plain.entropy.requires_grad
+    assert learning.entropy.requires_grad
+    assert torch.equal(plain.entropy, learning.entropy.detach())
+
+
 @pytest.fixture
 def half(policy, tokenizer):
     """Policy with the same weights in half precision."""

@@ -64,7 +64,7 @@ class LossInputs:
     """One microbatch with plans as rows. All shapes are (plans, tokens), except ``advantages``: (plans,).
 
     ``mask`` is true on a plan's tokens, including the end token, and false on all of a lost plan. ``reference`` and
-    ``entropy`` may be None if their coefficients are 0.
+    ``entropy`` may be None if their coefficients are 0. With coefficient 0, ``entropy`` is only logged and needs no gradient.
     """
 
     logprobs: Tensor

@@ -22,7 +22,7 @@ from embomatrix.trainer.config.errors import TrainerError, reason_of
 from embomatrix.trainer.config.settings import ComputeDtype, LoraSettings, TrainSettings
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
 from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
-from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
+from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left, token_entropy
 from embomatrix.world.json_text import parse_json
 
 HUB_TIMEOUT_S: Final = 10.0
@@ -177,14 +177,21 @@ class HfPolicy:
         return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own))
 
     def logprobs(
-        self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
+        self,
+        prompts: Sequence[Tokens],
+        tokens: Tensor,
+        mask: Tensor,
+        group: int,
+        temperature: float,
+        *,
+        entropy_gradient: bool = False,
     ) -> TokenScores:
         recompute = self._gradient_checkpointing and torch.is_grad_enabled()
         with self._precision():
             scores = (self._scores_recomputed if recompute else self._scores)(prompts, tokens, group)
         distribution = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
         chosen = distribution.gather(-1, tokens[..., None])[..., 0]
-        entropy = -(distribution.exp() * distribution).sum(dim=-1)
+        entropy = token_entropy(distribution, gradient=entropy_gradient)
         return TokenScores(chosen * mask, entropy * mask)
 
     def _precision(self) -> contextlib.AbstractContextManager[object]:
