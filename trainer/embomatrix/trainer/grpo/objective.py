@@ -36,7 +36,7 @@ class LossTotals:
 
 @dataclass(frozen=True, slots=True)
 class Advantages:
-    """``values``: (tasks, samples). ``zero_variance``: (tasks,), true for groups without a learning signal."""
+    """``values``: (tasks, samples). ``zero_variance``: (tasks,), true for groups whose advantages are all 0."""
 
     values: Tensor
     zero_variance: Tensor
