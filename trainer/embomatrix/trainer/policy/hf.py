@@ -2,6 +2,9 @@
 
 A group's prompt runs once, in sampling and in the update. Its key-value cache is repeated for the samples inside
 autograd, which gives the gradients of the plain computation in a third of the time.
+
+The scores of all tokens over the vocabulary are the largest tensor of an update: 8 plans of 512 tokens over 152,000 words
+have 2.5 GB in float32. The output layer therefore runs on chunks of the tokens, and again in the backward pass.
 """
 
 from __future__ import annotations
@@ -36,6 +39,8 @@ TOKENIZERS: Final = (
 )
 """Tokenizer files. A model folder holds at least one of them."""
 CONFIG: Final = "config.json"
+SCORES_PER_CHUNK: Final = 2**25
+"""Largest number of scores (tokens times vocabulary) that are computed at once: 128 MiB in float32."""
 CODEC_KEY: Final = "embomatrix_codec"
 """Key in the model's config.json for the codec that it was trained in."""
 REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name; `embomatrix model import-gguf` makes a folder"
@@ -63,6 +68,7 @@ class HfPolicy:
         self._autocast = autocast
         self.codec = codec
         self.module = model.eval()
+        self._has_plain_head = has_plain_head(model)
         self._gradient_checkpointing = gradient_checkpointing
         self._has_adapters = False
         self._tokenizer = tokenizer
@@ -156,7 +162,8 @@ class HfPolicy:
         generator: torch.Generator,
     ) -> Samples:
         with frozen_weights(self.module), self._precision():
-            cache, mask, scores = self._read(prompts, group)
+            cache, mask, states = self._read(prompts, group)
+            scores = self._head(states)[:, -1].float().repeat_interleave(group, dim=0)  # (rows, V)
             rows = scores.shape[0]
             lengths = mask.sum(dim=1)  # (rows,)
             end = torch.tensor(self._end, device=scores.device)
@@ -172,7 +179,8 @@ class HfPolicy:
                 if bool(done.all()) or at == max_new - 1:
                     break
                 mask = torch.cat([mask, mask.new_ones(rows, 1)], dim=1)
-                scores = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)[:, -1]
+                states = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)
+                scores = self._head(states)[:, -1].float()
         drawn, own = torch.stack(tokens, dim=1), torch.stack(masks, dim=1)
         return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own))
 
@@ -188,11 +196,32 @@ class HfPolicy:
     ) -> TokenScores:
         recompute = self._gradient_checkpointing and torch.is_grad_enabled()
         with self._precision():
-            scores = (self._scores_recomputed if recompute else self._scores)(prompts, tokens, group)
-        distribution = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
-        chosen = distribution.gather(-1, tokens[..., None])[..., 0]
-        entropy = token_entropy(distribution, gradient=entropy_gradient)
-        return TokenScores(chosen * mask, entropy * mask)
+            states = (self._states_recomputed if recompute else self._states)(prompts, tokens, group)
+            chosen, entropy = self._score(states[mask], tokens[mask], temperature, entropy_gradient)
+        empty = chosen.new_zeros(mask.shape)
+        return TokenScores(empty.masked_scatter(mask, chosen), empty.masked_scatter(mask, entropy))
+
+    def _score(
+        self, states: Tensor, tokens: Tensor, temperature: float, entropy_gradient: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Return log-probability and entropy (n,) of tokens (n,) after hidden states (n, C), chunk by chunk."""
+        head = self._head
+        score = functools.partial(
+            _token_scores, head, temperature=temperature, entropy_gradient=entropy_gradient
+        )
+        vocabulary = states.shape[-1] if isinstance(head, nn.Identity) else len(head.weight)
+        size = max(1, SCORES_PER_CHUNK // vocabulary)
+        chunks = list(zip(states.split(size), tokens.split(size), strict=True))
+        if len(chunks) > 1 and torch.is_grad_enabled():
+            # The backward pass computes each chunk's scores again. One chunk is small enough to keep.
+            score = functools.partial(checkpoint, score, use_reentrant=False, preserve_rng_state=False)
+        chosen, entropy = zip(*(score(*chunk) for chunk in chunks), strict=True)
+        return torch.cat(chosen), torch.cat(entropy)
+
+    @property
+    def _head(self) -> Any:
+        """Layer from the states of ``_run`` to scores."""
+        return self.module.get_output_embeddings() if self._has_plain_head else nn.Identity()
 
     def _precision(self) -> contextlib.AbstractContextManager[object]:
         """Context in which the model computes. It casts each weight that learns once, for all passes in it."""
@@ -200,60 +229,72 @@ class HfPolicy:
             return contextlib.nullcontext()
         return torch.autocast(self.module.device.type, dtype=self._autocast)
 
-    def _scores(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
-        """Scores (rows, T, V) of each token (rows, T). The prompt of a group runs once."""
+    def _run(self, ids: Tensor, *, keep: int, **inputs: Any) -> Tensor:
+        """Hidden states (rows, keep, C) of the last positions, or their scores (rows, keep, V) without a plain head."""
+        if self._has_plain_head:
+            states = self.module.get_decoder()(ids, **inputs).last_hidden_state
+            return states[:, -keep:]  # type: ignore[no-any-return]
+        return self.module(ids, logits_to_keep=keep, **inputs).logits  # type: ignore[no-any-return]
+
+    def _states(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
+        """States (rows, T, C) before each token (rows, T). The prompt of a group runs once."""
         cache, prompt_mask, first = self._read(prompts, group)
-        scores = first[:, None]  # (rows, 1, V)
+        states = first.repeat_interleave(group, dim=0)  # (rows, 1, C)
         length = tokens.shape[1]
         if length > 1:
             seen = torch.cat([prompt_mask, prompt_mask.new_ones(tokens.shape[0], length - 1)], dim=1)
             begin = prompt_mask.sum(dim=1, keepdim=True)
             positions = begin + torch.arange(length - 1, device=tokens.device)
-            scores = torch.cat([scores, self._extend(tokens[:, :-1], seen, positions, cache)], dim=1)
-        return scores
+            states = torch.cat([states, self._extend(tokens[:, :-1], seen, positions, cache)], dim=1)
+        return states
 
-    def _scores_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
-        """The same scores without a cache, storing only each layer's input."""
+    def _states_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
+        """The same states without a cache, storing only each layer's input."""
         ids, padding = pad_left(prompts, self._pad, self.module.device)
         mask = (~padding).long()
         rest = tokens[:, :-1]
         whole = torch.cat([ids.repeat_interleave(group, dim=0), rest], dim=1)  # (rows, P + T - 1)
         seen = torch.cat([mask.repeat_interleave(group, dim=0), mask.new_ones(rest.shape)], dim=1)
         with _checkpointed_layers(self.module):
-            result = self.module(
+            return self._run(
                 whole,
+                keep=tokens.shape[1],
                 attention_mask=seen,
                 position_ids=(seen.cumsum(dim=1) - 1).clamp(min=0),
                 use_cache=False,
-                logits_to_keep=tokens.shape[1],
             )
-        return result.logits.float()  # type: ignore[no-any-return]
 
     def _read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
-        """Run the prompts once. Return cache, mask (rows, P) and next-token scores (rows, V), repeated for the samples."""
+        """Run the prompts once.
+
+        Return cache and mask (rows, P), repeated for the samples, and the last state of each prompt (prompts, 1, C).
+        """
         from transformers import DynamicCache
 
         ids, padding = pad_left(prompts, self._pad, self.module.device)
         mask = (~padding).long()
         cache = DynamicCache(config=self.module.config)
-        result = self.module(
+        states = self._run(
             ids,
+            keep=1,
             attention_mask=mask,
             position_ids=(mask.cumsum(dim=1) - 1).clamp(min=0),
             past_key_values=cache,
             use_cache=True,
-            logits_to_keep=1,
         )
         cache.batch_repeat_interleave(group)
-        scores = result.logits[:, -1].float().repeat_interleave(group, dim=0)
-        return cache, mask.repeat_interleave(group, dim=0), scores
+        return cache, mask.repeat_interleave(group, dim=0), states
 
     def _extend(self, tokens: Tensor, mask: Tensor, positions: Tensor, cache: Any) -> Tensor:
-        """Scores (rows, T, V) after tokens (rows, T) that continue the cache."""
-        result = self.module(
-            tokens, attention_mask=mask, position_ids=positions, past_key_values=cache, use_cache=True
+        """States (rows, T, C) after tokens (rows, T) that continue the cache."""
+        return self._run(
+            tokens,
+            keep=tokens.shape[1],
+            attention_mask=mask,
+            position_ids=positions,
+            past_key_values=cache,
+            use_cache=True,
         )
-        return result.logits.float()  # type: ignore[no-any-return]
 
     def _texts(self, tokens: Tensor, mask: Tensor) -> tuple[str, ...]:
         """Decode the samples without special tokens. The mask marks the end, because end and padding tokens may be equal."""
@@ -301,6 +342,31 @@ class HfPolicy:
             return Codec(config[CODEC_KEY])
         except (OSError, ValueError, TypeError, KeyError):
             return None
+
+
+def _token_scores(
+    head: nn.Module, states: Tensor, tokens: Tensor, *, temperature: float, entropy_gradient: bool
+) -> tuple[Tensor, Tensor]:
+    """Return log-probability and entropy (n,) of tokens (n,) after states (n, C)."""
+    distribution = torch.log_softmax(head(states).float() / (temperature or 1.0), dim=-1)  # (n, V)
+    chosen = distribution.gather(-1, tokens[:, None])[:, 0]
+    return chosen, token_entropy(distribution, gradient=entropy_gradient)
+
+
+@torch.no_grad()
+def has_plain_head(model: Any) -> bool:
+    """True if the model's scores are its output layer on its decoder's hidden states.
+
+    Some families scale or cap the scores afterwards (Gemma 2, Granite, Cohere), under different names in their
+    configurations. The function therefore compares the scores of two tokens.
+    """
+    ids = torch.tensor([[0, 1]], device=model.device)
+    try:
+        states = model.get_decoder()(ids, use_cache=False).last_hidden_state
+        scores = model.get_output_embeddings()(states)
+    except (AttributeError, TypeError, RuntimeError):  # no such parts, or they don't fit together
+        return False
+    return torch.equal(scores, model(ids, use_cache=False).logits)
 
 
 @contextlib.contextmanager
