@@ -26,7 +26,7 @@ from embomatrix.trainer.evaluation.models import load_model
 from embomatrix.trainer.lifecycle.checkpoint import CheckpointStore, TrainingProgress
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
-from embomatrix.trainer.policy import hf
+from embomatrix.trainer.policy import token_scores
 from embomatrix.trainer.policy.compute_dtype import use_compute_dtype
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.import_gguf import import_gguf
@@ -98,7 +98,7 @@ def learnt_in_chunks(policy, monkeypatch, tokens):
     """
     module, vocabulary = policy.module, policy.module.config.vocab_size
     head = module.get_output_embeddings()
-    monkeypatch.setattr(hf, "SCORES_PER_CHUNK", tokens * vocabulary)
+    monkeypatch.setattr(token_scores, "SCORES_PER_CHUNK", tokens * vocabulary)
     prompt_ids = prompts(policy, 2)
     ids = torch.arange(4 * 7).view(4, 7) % 30 + 2
     mask = torch.arange(7) < torch.tensor([[7], [3], [5], [1]])
@@ -187,9 +187,9 @@ def test_capped_scores_are_those_of_the_model(tokenizer, monkeypatch):
 
 
 def test_head_is_plain_only_if_it_gives_the_scores_of_the_model(tokenizer):
-    assert hf.has_plain_head(random_llama(tokenizer))
-    assert not hf.has_plain_head(capped_gemma(tokenizer).eval())
-    assert not hf.has_plain_head(capped_gemma(tokenizer).eval().bfloat16())
+    assert token_scores.has_plain_head(random_llama(tokenizer))
+    assert not token_scores.has_plain_head(capped_gemma(tokenizer).eval())
+    assert not token_scores.has_plain_head(capped_gemma(tokenizer).eval().bfloat16())
 
 
 @pytest.fixture

@@ -2,9 +2,6 @@
 
 A group's prompt runs once, in sampling and in the update. Its key-value cache is repeated for the samples inside
 autograd, which gives the gradients of the plain computation in a third of the time.
-
-The scores of all tokens over the vocabulary are the largest tensor of an update: 8 plans of 512 tokens over 152,000 words
-have 2.5 GB in float32. The output layer therefore runs on chunks of the tokens, and again in the backward pass.
 """
 
 from __future__ import annotations
@@ -25,7 +22,8 @@ from embomatrix.trainer.config.errors import TrainerError, reason_of
 from embomatrix.trainer.config.settings import ComputeDtype, LoraSettings, TrainSettings
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
 from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
-from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left, token_entropy
+from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
+from embomatrix.trainer.policy.token_scores import chunked_scores, has_plain_head
 from embomatrix.world.json_text import parse_json
 
 HUB_TIMEOUT_S: Final = 10.0
@@ -39,8 +37,6 @@ TOKENIZERS: Final = (
 )
 """Tokenizer files. A model folder holds at least one of them."""
 CONFIG: Final = "config.json"
-SCORES_PER_CHUNK: Final = 2**25
-"""Largest number of scores (tokens times vocabulary) that are computed at once: 128 MiB in float32."""
 CODEC_KEY: Final = "embomatrix_codec"
 """Key in the model's config.json for the codec that it was trained in."""
 REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name; `embomatrix model import-gguf` makes a folder"
@@ -197,26 +193,11 @@ class HfPolicy:
         recompute = self._gradient_checkpointing and torch.is_grad_enabled()
         with self._precision():
             states = (self._states_recomputed if recompute else self._states)(prompts, tokens, group)
-            chosen, entropy = self._score(states[mask], tokens[mask], temperature, entropy_gradient)
+            chosen, entropy = chunked_scores(
+                self._head, states[mask], tokens[mask], temperature, entropy_gradient=entropy_gradient
+            )
         empty = chosen.new_zeros(mask.shape)
         return TokenScores(empty.masked_scatter(mask, chosen), empty.masked_scatter(mask, entropy))
-
-    def _score(
-        self, states: Tensor, tokens: Tensor, temperature: float, entropy_gradient: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Return log-probability and entropy (n,) of tokens (n,) after hidden states (n, C), chunk by chunk."""
-        head = self._head
-        score = functools.partial(
-            _token_scores, head, temperature=temperature, entropy_gradient=entropy_gradient
-        )
-        vocabulary = states.shape[-1] if isinstance(head, nn.Identity) else len(head.weight)
-        size = max(1, SCORES_PER_CHUNK // vocabulary)
-        chunks = list(zip(states.split(size), tokens.split(size), strict=True))
-        if len(chunks) > 1 and torch.is_grad_enabled():
-            # The backward pass computes each chunk's scores again. One chunk is small enough to keep.
-            score = functools.partial(checkpoint, score, use_reentrant=False, preserve_rng_state=False)
-        chosen, entropy = zip(*(score(*chunk) for chunk in chunks), strict=True)
-        return torch.cat(chosen), torch.cat(entropy)
 
     @property
     def _head(self) -> Any:
@@ -342,31 +323,6 @@ class HfPolicy:
             return Codec(config[CODEC_KEY])
         except (OSError, ValueError, TypeError, KeyError):
             return None
-
-
-def _token_scores(
-    head: nn.Module, states: Tensor, tokens: Tensor, *, temperature: float, entropy_gradient: bool
-) -> tuple[Tensor, Tensor]:
-    """Return log-probability and entropy (n,) of tokens (n,) after states (n, C)."""
-    distribution = torch.log_softmax(head(states).float() / (temperature or 1.0), dim=-1)  # (n, V)
-    chosen = distribution.gather(-1, tokens[:, None])[:, 0]
-    return chosen, token_entropy(distribution, gradient=entropy_gradient)
-
-
-@torch.no_grad()
-def has_plain_head(model: Any) -> bool:
-    """True if the model's scores are its output layer on its decoder's hidden states.
-
-    Some families scale or cap the scores afterwards (Gemma 2, Granite, Cohere), under different names in their
-    configurations. The function therefore compares the scores of two tokens.
-    """
-    ids = torch.tensor([[0, 1]], device=model.device)
-    try:
-        states = model.get_decoder()(ids, use_cache=False).last_hidden_state
-        scores = model.get_output_embeddings()(states)
-    except (AttributeError, TypeError, RuntimeError):  # no such parts, or they don't fit together
-        return False
-    return torch.equal(scores, model(ids, use_cache=False).logits)
 
 
 @contextlib.contextmanager
