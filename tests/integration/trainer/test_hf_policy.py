@@ -26,6 +26,7 @@ from embomatrix.trainer.evaluation.models import load_model
 from embomatrix.trainer.lifecycle.checkpoint import CheckpointStore, TrainingProgress
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
+from embomatrix.trainer.policy import token_scores
 from embomatrix.trainer.policy.compute_dtype import use_compute_dtype
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.import_gguf import import_gguf
@@ -78,6 +79,117 @@ def test_shared_prompt_gives_the_same_gradient(policy):
         for row in range(2)
     ]
     assert torch.allclose(shared, gradient(rows[0] + rows[1]), atol=1e-4, rtol=1e-3)
+
+
+def test_entropy_has_a_graph_only_on_request(policy):
+    prompt_ids = prompts(policy)
+    samples = policy.sample(prompt_ids, 2, 1.0, 8, torch.Generator().manual_seed(0))
+    plain = policy.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0)
+    learning = policy.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0, entropy_gradient=True)
+    assert not plain.entropy.requires_grad
+    assert learning.entropy.requires_grad
+    assert torch.equal(plain.entropy, learning.entropy.detach())
+
+
+def learnt_in_chunks(policy, monkeypatch, tokens):
+    """Score plans with chunks of this many tokens and back-propagate log-probabilities and entropy.
+
+    Return the scores, the gradient, and the largest number of rows of scores that any tensor of the graph had.
+    """
+    module, vocabulary = policy.module, policy.module.config.vocab_size
+    head = module.get_output_embeddings()
+    monkeypatch.setattr(token_scores, "SCORES_PER_CHUNK", tokens * vocabulary)
+    prompt_ids = prompts(policy, 2)
+    ids = torch.arange(4 * 7).view(4, 7) % 30 + 2
+    mask = torch.arange(7) < torch.tensor([[7], [3], [5], [1]])
+    rows = []
+
+    def record(tensor):
+        is_weight = tensor.data_ptr() == head.weight.data_ptr()
+        if tensor.shape and tensor.shape[-1] == vocabulary and not is_weight:
+            rows.append(tensor.numel() // vocabulary)
+        return tensor
+
+    hook = head.register_forward_hook(lambda *call: record(call[-1]))
+    hooks = torch.autograd.graph.saved_tensors_hooks(record, lambda tensor: tensor)
+    module.zero_grad()
+    with hooks:
+        scores = policy.logprobs(prompt_ids, ids, mask, 2, 0.9, entropy_gradient=True)
+    (scores.logprobs.sum() + 0.1 * scores.entropy.sum()).backward()
+    hook.remove()
+    gradient = torch.cat([each.grad.flatten() for each in policy.parameters() if each.grad is not None])
+    return scores, gradient, max(rows)
+
+
+@pytest.mark.parametrize("lora", [False, True])
+@pytest.mark.parametrize("recompute", [False, True])
+def test_chunks_give_the_scores_and_the_gradient_of_the_whole(tokenizer, monkeypatch, lora, recompute):
+    policy = HfPolicy(
+        random_llama(tokenizer), tokenizer, Codec.LINES, "random llama", gradient_checkpointing=recompute
+    )
+    if lora:
+        policy.adapt(LoraSettings(rank=2, alpha=4.0), seed=0)
+    whole, whole_gradient, _ = learnt_in_chunks(policy, monkeypatch, 100)
+    parts, gradient, largest = learnt_in_chunks(policy, monkeypatch, 3)
+    assert largest <= 3
+    assert torch.allclose(parts.logprobs, whole.logprobs, atol=1e-5)
+    assert torch.allclose(parts.entropy, whole.entropy, atol=1e-5)
+    assert torch.allclose(gradient, whole_gradient, atol=1e-5 * float(whole_gradient.abs().max()))
+
+
+def test_only_scored_tokens_have_scores(policy, monkeypatch):
+    assert learnt_in_chunks(policy, monkeypatch, 100)[2] == 7 + 3 + 5 + 1
+
+
+def test_chunks_learn_in_automatic_mixed_precision(policy, tmp_path, monkeypatch):
+    policy.save(tmp_path)
+    mixed = saved_policy(tmp_path, TrainSettings(device="cpu:0"))
+    whole, whole_gradient, _ = learnt_in_chunks(mixed, monkeypatch, 100)
+    parts, gradient, largest = learnt_in_chunks(mixed, monkeypatch, 3)
+    assert largest <= 3
+    assert torch.allclose(parts.logprobs, whole.logprobs, atol=0.05)
+    assert torch.allclose(gradient, whole_gradient, atol=0.02 * float(whole_gradient.abs().max()))
+
+
+def capped_gemma(tokenizer):
+    """Return a random Gemma 2, a family whose scores are capped after the output layer."""
+    from transformers import Gemma2Config, Gemma2ForCausalLM
+
+    torch.manual_seed(0)
+    config = Gemma2Config(
+        vocab_size=len(tokenizer),
+        hidden_size=32,
+        intermediate_size=64,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        num_key_value_heads=2,
+        head_dim=8,
+        final_logit_softcapping=1.0,
+        eos_token_id=tokenizer.eos_token_id,
+    )
+    return Gemma2ForCausalLM(config)
+
+
+def test_capped_scores_are_those_of_the_model(tokenizer, monkeypatch):
+    policy = HfPolicy(capped_gemma(tokenizer), tokenizer, Codec.LINES, "random gemma")
+    whole, whole_gradient, _ = learnt_in_chunks(policy, monkeypatch, 100)
+    parts, gradient, _ = learnt_in_chunks(policy, monkeypatch, 3)
+    assert torch.allclose(parts.logprobs, whole.logprobs, atol=1e-5)
+    assert torch.allclose(gradient, whole_gradient, atol=1e-5 * float(whole_gradient.abs().max()))
+    prompt_ids = prompts(policy, 1)
+    samples = policy.sample(prompt_ids, 2, 1.0, 6, torch.Generator().manual_seed(0))
+    scored = policy.logprobs(prompt_ids, samples.tokens, samples.mask, 2, 1.0).logprobs
+    assert torch.allclose(scored, samples.logprobs, atol=1e-5)
+    text = torch.tensor([[*prompt_ids[0], *samples.tokens[0].tolist()]])
+    scores = policy.module(text).logits[0, len(prompt_ids[0]) - 1 : -1]
+    plain = torch.log_softmax(scores, -1).gather(-1, samples.tokens[0][:, None])[:, 0]
+    assert torch.allclose(scored[0], plain * samples.mask[0], atol=1e-4)
+
+
+def test_head_is_plain_only_if_it_gives_the_scores_of_the_model(tokenizer):
+    assert token_scores.has_plain_head(random_llama(tokenizer))
+    assert not token_scores.has_plain_head(capped_gemma(tokenizer).eval())
+    assert not token_scores.has_plain_head(capped_gemma(tokenizer).eval().bfloat16())
 
 
 @pytest.fixture

@@ -54,6 +54,18 @@ def test_sampler_and_update_agree_on_log_probabilities():
     assert (scored.entropy[samples.mask] > 0).any()
 
 
+def test_entropy_has_a_graph_only_on_request():
+    made = policy()
+    prompt_ids = prompts(made)
+    samples = draw(made, prompt_ids)
+    plain = made.logprobs(prompt_ids, samples.tokens, samples.mask, 4, 1.3)
+    learning = made.logprobs(prompt_ids, samples.tokens, samples.mask, 4, 1.3, entropy_gradient=True)
+    assert not plain.entropy.requires_grad
+    assert learning.entropy.requires_grad
+    assert torch.equal(plain.entropy, learning.entropy.detach())
+    assert torch.equal(plain.logprobs, learning.logprobs)
+
+
 def test_padding_and_prompt_sharing_do_not_change_values_or_gradients():
     made = policy()
     prompt_ids = [prompts(made)[0][:9], *prompts(made)[1:]]

@@ -81,6 +81,13 @@ class OnLost(StrEnum):
     PARTIAL = "partial"  # leave out the lost rollout only
 
 
+class ZeroVariance(StrEnum):
+    """Treatment of a group whose rewards are all equal. Its advantages are 0, but not its KL and entropy terms."""
+
+    SKIP = "skip"  # leave out the group: no forward and no backward pass
+    KEEP = "keep"  # learn its KL and entropy terms, as TRL does
+
+
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -190,6 +197,8 @@ class GrpoSettings(_Frozen):
     seed_per: SeedPer = SeedPer.EPOCH
     """Time for which a task keeps the seed of its rollouts."""
     on_lost: OnLost = OnLost.GROUP
+    zero_variance: ZeroVariance = ZeroVariance.SKIP
+    """Groups whose rewards are all equal. ``LANGUAGE_MODEL_DEFAULTS`` keep them. A ``reserve`` replaces them in any case."""
     overlap: Overlap = Overlap.STREAM
     reserve: int = Field(default=0, ge=0)
     """Dynamic sampling: maximum tasks per step that replace zero-variance groups."""
@@ -206,6 +215,12 @@ class GrpoSettings(_Frozen):
     def ratio_level(self) -> RatioLevel:
         """Level of the importance ratio. GSPO is defined with the geometric mean."""
         return RatioLevel.MEAN if self.loss is LossKind.GSPO else self.ratio
+
+    @property
+    def keeps_zero_variance_groups(self) -> bool:
+        """True if zero-variance groups stay in the update. Without KL and entropy terms their gradient would be 0."""
+        has_terms = self.kl_coef > 0 or self.entropy_coef > 0
+        return self.zero_variance is ZeroVariance.KEEP and has_terms and not self.reserve
 
 
 class RewardTable(_Frozen):
@@ -284,8 +299,10 @@ LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "grpo.chunk": 1,
     "grpo.learning_rate": 1e-5,
     "grpo.max_new": 96,
+    "grpo.zero_variance": "keep",
 }
-"""Defaults that differ for a pretrained model: it already knows words, and it needs more memory."""
+"""Defaults that differ for a pretrained model: it already knows words, it needs more memory, and TRL's updates keep
+zero-variance groups."""
 
 
 def read_settings(

@@ -53,7 +53,12 @@ class Learner:
         """Add the microbatch's gradient to the gradients of the policy's parameters."""
         settings = self._settings
         scores = self._policy.logprobs(
-            microbatch.prompts, microbatch.tokens, microbatch.mask, settings.group, settings.temperature
+            microbatch.prompts,
+            microbatch.tokens,
+            microbatch.mask,
+            settings.group,
+            settings.temperature,
+            entropy_gradient=settings.entropy_coef > 0,
         )
         inputs = LossInputs(
             logprobs=scores.logprobs,

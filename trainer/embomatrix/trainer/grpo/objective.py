@@ -36,7 +36,7 @@ class LossTotals:
 
 @dataclass(frozen=True, slots=True)
 class Advantages:
-    """``values``: (tasks, samples). ``zero_variance``: (tasks,), true for groups without a learning signal."""
+    """``values``: (tasks, samples). ``zero_variance``: (tasks,), true for groups whose advantages are all 0."""
 
     values: Tensor
     zero_variance: Tensor
@@ -64,7 +64,7 @@ class LossInputs:
     """One microbatch with plans as rows. All shapes are (plans, tokens), except ``advantages``: (plans,).
 
     ``mask`` is true on a plan's tokens, including the end token, and false on all of a lost plan. ``reference`` and
-    ``entropy`` may be None if their coefficients are 0.
+    ``entropy`` may be None if their coefficients are 0. With coefficient 0, ``entropy`` is only logged and needs no gradient.
     """
 
     logprobs: Tensor

@@ -49,7 +49,7 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class GroupLog:
-    """One task's plans of a step. ``zero_variance``: equal rewards or too few of them, so the group had no learning signal."""
+    """One task's plans of a step. ``zero_variance``: equal rewards or too few of them, so all advantages are 0."""
 
     task: TrainingTask
     outcomes: tuple[PlanOutcome, ...]

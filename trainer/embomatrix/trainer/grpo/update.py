@@ -203,10 +203,10 @@ class Updater:
                 chunks = self._sample(plan, plan.step, tasks, next_index)
             next_index += len(chunks)
             self._learn_all(chunks, state)
-        if state.signal_plans:
+        if state.learnt_plans:
             kind = self._settings.loss
             final = LossTotals(
-                plans=state.signal_plans,
+                plans=state.learnt_plans,
                 tokens=sum(metrics.weight for metrics in state.metrics),
                 longest=self._settings.max_new,
                 microbatches=len(state.metrics),
@@ -219,7 +219,10 @@ class Updater:
     def _microbatch(
         self, chunk: SampledChunk, outcomes: Sequence[tuple[PlanOutcome, ...]], state: _StepState
     ) -> tuple[Microbatch | None, list[GroupLog]]:
-        """Return a chunk's groups with a learning signal as a microbatch, None if there are none, and all groups' logs."""
+        """Return the groups to learn from as a microbatch, None if there are none, and the logs of all groups.
+
+        Zero-variance groups are among them if the settings keep their KL and entropy terms, unless all rollouts are lost.
+        """
         rewards = torch.tensor(
             [[outcome.weighted_reward(state.plan.relevance) for outcome in group] for group in outcomes]
         )  # (tasks, G)
@@ -233,7 +236,10 @@ class Updater:
                 chunk.tasks, outcomes, advantages.values.tolist(), zero_variance, strict=True
             )
         ]
-        kept = [row for row, flat in enumerate(zero_variance) if not flat]
+        learns = ~advantages.zero_variance
+        if self._settings.keeps_zero_variance_groups:
+            learns = ~torch.isnan(rewards).all(dim=1)
+        kept = [row for row, present in enumerate(learns.tolist()) if present]
         if not kept:
             return None, logs
         group, samples = self._settings.group, chunk.samples
@@ -282,7 +288,7 @@ class Updater:
 
 @dataclass(frozen=True, slots=True)
 class _LearntChunk:
-    """Back-propagated chunk. ``metrics`` is None without a signal, ``gradient`` if it is already in the step's sum."""
+    """Back-propagated chunk. ``metrics`` is None without a gradient, ``gradient`` if it is already in the step's sum."""
 
     logs: list[GroupLog]
     metrics: LossMetrics | None = None
@@ -324,17 +330,17 @@ class _RemoteChunk:
 
 
 class _StepState:
-    """Accumulated groups of a step, and the metrics and plans of its microbatches with a learning signal."""
+    """Accumulated groups of a step, and the metrics and plans of its microbatches."""
 
     def __init__(self, plan: StepPlan, totals: LossTotals) -> None:
         self.plan = plan
         self.totals = totals
         self.logs: list[GroupLog] = []
         self.metrics: list[LossMetrics] = []
-        self.signal_plans = 0
+        self.learnt_plans = 0
 
     def count(self, learnt: _LearntChunk) -> None:
         self.logs += learnt.logs
         if learnt.metrics is not None:
             self.metrics.append(learnt.metrics)
-            self.signal_plans += learnt.plans
+            self.learnt_plans += learnt.plans

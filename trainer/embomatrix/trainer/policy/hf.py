@@ -23,6 +23,7 @@ from embomatrix.trainer.config.settings import ComputeDtype, LoraSettings, Train
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
 from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
+from embomatrix.trainer.policy.token_scores import chunked_scores, has_plain_head
 from embomatrix.world.json_text import parse_json
 
 HUB_TIMEOUT_S: Final = 10.0
@@ -63,6 +64,7 @@ class HfPolicy:
         self._autocast = autocast
         self.codec = codec
         self.module = model.eval()
+        self._has_plain_head = has_plain_head(model)
         self._gradient_checkpointing = gradient_checkpointing
         self._has_adapters = False
         self._tokenizer = tokenizer
@@ -156,7 +158,8 @@ class HfPolicy:
         generator: torch.Generator,
     ) -> Samples:
         with frozen_weights(self.module), self._precision():
-            cache, mask, scores = self._read(prompts, group)
+            cache, mask, states = self._read(prompts, group)
+            scores = self._head(states)[:, -1].float().repeat_interleave(group, dim=0)  # (rows, V)
             rows = scores.shape[0]
             lengths = mask.sum(dim=1)  # (rows,)
             end = torch.tensor(self._end, device=scores.device)
@@ -172,20 +175,34 @@ class HfPolicy:
                 if bool(done.all()) or at == max_new - 1:
                     break
                 mask = torch.cat([mask, mask.new_ones(rows, 1)], dim=1)
-                scores = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)[:, -1]
+                states = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)
+                scores = self._head(states)[:, -1].float()
         drawn, own = torch.stack(tokens, dim=1), torch.stack(masks, dim=1)
         return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own))
 
     def logprobs(
-        self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
+        self,
+        prompts: Sequence[Tokens],
+        tokens: Tensor,
+        mask: Tensor,
+        group: int,
+        temperature: float,
+        *,
+        entropy_gradient: bool = False,
     ) -> TokenScores:
         recompute = self._gradient_checkpointing and torch.is_grad_enabled()
         with self._precision():
-            scores = (self._scores_recomputed if recompute else self._scores)(prompts, tokens, group)
-        distribution = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
-        chosen = distribution.gather(-1, tokens[..., None])[..., 0]
-        entropy = -(distribution.exp() * distribution).sum(dim=-1)
-        return TokenScores(chosen * mask, entropy * mask)
+            states = (self._states_recomputed if recompute else self._states)(prompts, tokens, group)
+            chosen, entropy = chunked_scores(
+                self._head, states[mask], tokens[mask], temperature, entropy_gradient=entropy_gradient
+            )
+        empty = chosen.new_zeros(mask.shape)
+        return TokenScores(empty.masked_scatter(mask, chosen), empty.masked_scatter(mask, entropy))
+
+    @property
+    def _head(self) -> Any:
+        """Layer from the states of ``_run`` to scores."""
+        return self.module.get_output_embeddings() if self._has_plain_head else nn.Identity()
 
     def _precision(self) -> contextlib.AbstractContextManager[object]:
         """Context in which the model computes. It casts each weight that learns once, for all passes in it."""
@@ -193,60 +210,72 @@ class HfPolicy:
             return contextlib.nullcontext()
         return torch.autocast(self.module.device.type, dtype=self._autocast)
 
-    def _scores(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
-        """Scores (rows, T, V) of each token (rows, T). The prompt of a group runs once."""
+    def _run(self, ids: Tensor, *, keep: int, **inputs: Any) -> Tensor:
+        """Hidden states (rows, keep, C) of the last positions, or their scores (rows, keep, V) without a plain head."""
+        if self._has_plain_head:
+            states = self.module.get_decoder()(ids, **inputs).last_hidden_state
+            return states[:, -keep:]  # type: ignore[no-any-return]
+        return self.module(ids, logits_to_keep=keep, **inputs).logits  # type: ignore[no-any-return]
+
+    def _states(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
+        """States (rows, T, C) before each token (rows, T). The prompt of a group runs once."""
         cache, prompt_mask, first = self._read(prompts, group)
-        scores = first[:, None]  # (rows, 1, V)
+        states = first.repeat_interleave(group, dim=0)  # (rows, 1, C)
         length = tokens.shape[1]
         if length > 1:
             seen = torch.cat([prompt_mask, prompt_mask.new_ones(tokens.shape[0], length - 1)], dim=1)
             begin = prompt_mask.sum(dim=1, keepdim=True)
             positions = begin + torch.arange(length - 1, device=tokens.device)
-            scores = torch.cat([scores, self._extend(tokens[:, :-1], seen, positions, cache)], dim=1)
-        return scores
+            states = torch.cat([states, self._extend(tokens[:, :-1], seen, positions, cache)], dim=1)
+        return states
 
-    def _scores_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
-        """The same scores without a cache, storing only each layer's input."""
+    def _states_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
+        """The same states without a cache, storing only each layer's input."""
         ids, padding = pad_left(prompts, self._pad, self.module.device)
         mask = (~padding).long()
         rest = tokens[:, :-1]
         whole = torch.cat([ids.repeat_interleave(group, dim=0), rest], dim=1)  # (rows, P + T - 1)
         seen = torch.cat([mask.repeat_interleave(group, dim=0), mask.new_ones(rest.shape)], dim=1)
         with _checkpointed_layers(self.module):
-            result = self.module(
+            return self._run(
                 whole,
+                keep=tokens.shape[1],
                 attention_mask=seen,
                 position_ids=(seen.cumsum(dim=1) - 1).clamp(min=0),
                 use_cache=False,
-                logits_to_keep=tokens.shape[1],
             )
-        return result.logits.float()  # type: ignore[no-any-return]
 
     def _read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
-        """Run the prompts once. Return cache, mask (rows, P) and next-token scores (rows, V), repeated for the samples."""
+        """Run the prompts once.
+
+        Return cache and mask (rows, P), repeated for the samples, and the last state of each prompt (prompts, 1, C).
+        """
         from transformers import DynamicCache
 
         ids, padding = pad_left(prompts, self._pad, self.module.device)
         mask = (~padding).long()
         cache = DynamicCache(config=self.module.config)
-        result = self.module(
+        states = self._run(
             ids,
+            keep=1,
             attention_mask=mask,
             position_ids=(mask.cumsum(dim=1) - 1).clamp(min=0),
             past_key_values=cache,
             use_cache=True,
-            logits_to_keep=1,
         )
         cache.batch_repeat_interleave(group)
-        scores = result.logits[:, -1].float().repeat_interleave(group, dim=0)
-        return cache, mask.repeat_interleave(group, dim=0), scores
+        return cache, mask.repeat_interleave(group, dim=0), states
 
     def _extend(self, tokens: Tensor, mask: Tensor, positions: Tensor, cache: Any) -> Tensor:
-        """Scores (rows, T, V) after tokens (rows, T) that continue the cache."""
-        result = self.module(
-            tokens, attention_mask=mask, position_ids=positions, past_key_values=cache, use_cache=True
+        """States (rows, T, C) after tokens (rows, T) that continue the cache."""
+        return self._run(
+            tokens,
+            keep=tokens.shape[1],
+            attention_mask=mask,
+            position_ids=positions,
+            past_key_values=cache,
+            use_cache=True,
         )
-        return result.logits.float()  # type: ignore[no-any-return]
 
     def _texts(self, tokens: Tensor, mask: Tensor) -> tuple[str, ...]:
         """Decode the samples without special tokens. The mask marks the end, because end and padding tokens may be equal."""

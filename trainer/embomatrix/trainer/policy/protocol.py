@@ -32,7 +32,10 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class TokenScores:
-    """Log-probability of each token and entropy of its distribution, both (rows, tokens)."""
+    """Log-probability of each token and entropy of its distribution, both (rows, tokens).
+
+    The entropy has a gradient only on request: its graph holds several tensors of the size of all scores.
+    """
 
     logprobs: Tensor
     entropy: Tensor
@@ -70,9 +73,16 @@ class Policy(Protocol):
         ...
 
     def logprobs(
-        self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
+        self,
+        prompts: Sequence[Tokens],
+        tokens: Tensor,
+        mask: Tensor,
+        group: int,
+        temperature: float,
+        *,
+        entropy_gradient: bool = False,
     ) -> TokenScores:
-        """Score completions in the layout of ``Samples``, with gradients."""
+        """Score completions in the layout of ``Samples``. Log-probabilities have gradients, the entropy on request."""
         ...
 
     def parameters(self) -> Iterator[nn.Parameter]: ...
@@ -102,6 +112,13 @@ def draw(scores: Tensor, temperature: float, generator: torch.Generator) -> tupl
         below = torch.minimum(drawn * total, torch.nextafter(total, torch.zeros_like(total)))
         choice = torch.searchsorted(cumulative, below, right=True)
     return choice[:, 0], logprobs.gather(-1, choice)[:, 0]
+
+
+def token_entropy(logprobs: Tensor, *, gradient: bool, minimum: float | None = None) -> Tensor:
+    """Return the entropy (...) of each distribution (..., V). Lower log-probabilities count as ``minimum``."""
+    with torch.set_grad_enabled(gradient and torch.is_grad_enabled()):
+        bounded = logprobs if minimum is None else logprobs.clamp(min=minimum)
+        return -(bounded.exp() * bounded).sum(dim=-1)
 
 
 def pad_left(prompts: Sequence[Tokens], fill: int, device: torch.device) -> tuple[Tensor, Tensor]:

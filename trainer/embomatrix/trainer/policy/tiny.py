@@ -17,7 +17,7 @@ from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.policy.compute_dtype import frozen_weights
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape, PlanCache, PromptCache, check_weights
 from embomatrix.trainer.policy.grammar import GrammarState, PlanGrammar, PromptNames
-from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
+from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left, token_entropy
 from embomatrix.trainer.policy.tensor_file import read_tensors
 from embomatrix.trainer.policy.vocabulary import END, GO, PAD, Vocabulary
 from embomatrix.world.json_text import parse_json
@@ -154,7 +154,14 @@ class TinyPolicy:
         return _SamplingState(rows, active, cache, names, self._grammar.start(len(rows)), None)
 
     def logprobs(
-        self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
+        self,
+        prompts: Sequence[Tokens],
+        tokens: Tensor,
+        mask: Tensor,
+        group: int,
+        temperature: float,
+        *,
+        entropy_gradient: bool = False,
     ) -> TokenScores:
         cache = self.module.encode_prompts(*pad_left(prompts, PAD, self.device))
         prompt_of_row = torch.arange(len(tokens), device=self.device) // group
@@ -166,7 +173,11 @@ class TinyPolicy:
         for rows in order.tensor_split(min(_LENGTH_BUCKETS, len(order))):
             length = max(1, int(lengths[rows].max()))
             bucket = cache.select(prompt_of_row[rows])
-            scores.append(self._score(bucket, tokens[rows, :length], token_masks[rows, :length], temperature))
+            scores.append(
+                self._score(
+                    bucket, tokens[rows, :length], token_masks[rows, :length], temperature, entropy_gradient
+                )
+            )
         restore_order = torch.argsort(order)
         length = tokens.shape[1]
         chosen, entropy = (
@@ -176,7 +187,12 @@ class TinyPolicy:
         return TokenScores(chosen * mask, entropy * mask)
 
     def _score(
-        self, prompts: PromptCache, tokens: Tensor, token_masks: Tensor, temperature: float
+        self,
+        prompts: PromptCache,
+        tokens: Tensor,
+        token_masks: Tensor,
+        temperature: float,
+        entropy_gradient: bool,
     ) -> tuple[Tensor, Tensor]:
         """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks: (rows, T, V)."""
         hidden, plan = prompts.last, None  # (rows, 1, C)
@@ -187,9 +203,7 @@ class TinyPolicy:
             self.module.scores(hidden, prompts, plan, token_masks) / (temperature or 1.0), dim=-1
         )  # (rows, T, V)
         chosen = scores.gather(-1, tokens[..., None])[..., 0]
-        bounded = scores.clamp(min=_MIN_LOGPROB)
-        entropy = -(bounded.exp() * bounded).sum(dim=-1)
-        return chosen, entropy
+        return chosen, token_entropy(scores, gradient=entropy_gradient, minimum=_MIN_LOGPROB)
 
     def frozen_copy(self) -> TinyPolicy:
         twin = copy.copy(self)
