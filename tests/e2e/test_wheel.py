@@ -70,7 +70,7 @@ def test_installed_wheel_plays_a_shipped_task_with_the_shipped_policy(environmen
     command = [
         str(environment / "bin/embomatrix"),
         "play",
-        "put the apple in the lunch box",
+        "put the apple in the fridge",
         "--policy",
         "shipped",
     ]
@@ -84,7 +84,7 @@ def test_installed_wheel_plays_a_shipped_task_with_the_shipped_policy(environmen
         check=False,
     )
     assert played.returncode == 0, played.stderr
-    assert "move apple_1" in played.stdout
+    assert "move meat_loaf_1" in played.stdout
     assert "the text is a plan" in played.stdout
     where = "import embomatrix.cli, embomatrix.trainer; print(embomatrix.cli.__path__, embomatrix.trainer.__path__)"
     found = subprocess.run(

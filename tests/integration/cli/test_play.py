@@ -125,12 +125,12 @@ def test_shipped_policy_plays_a_shipped_task(tmp_path):
     unpack(tmp_path)
     app = typer.Typer()
     app.command()(play)
-    words = "The apple is still on the countertop, but it belongs in the lunch box."
+    words = "put the apple in the fridge"
     result = CliRunner().invoke(
         app, [words, "--policy", "shipped", "--dataset", str(tmp_path)], env={"COLUMNS": "160"}
     )
     assert result.exit_code == 0, result.output
-    assert "put apple_1 inside lunch_box_1" in result.output
+    assert "put meat_loaf_1 inside fridge_1" in result.output
     assert "success" in result.output
 
 

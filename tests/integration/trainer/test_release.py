@@ -37,4 +37,4 @@ def test_shipped_policy_loads_and_its_card_says_what_it_is():
     assert settings.model == "tiny"
     card = (shipped_policy() / CARD).read_text()
     assert "embomatrix demo --seed 0" in card
-    assert "| all | 120 |" in card
+    assert "| all | 200 |" in card
