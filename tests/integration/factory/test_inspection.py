@@ -173,7 +173,6 @@ def test_hub_library_reads_file_and_card(dataset, tmp_path):
     library = pytest.importorskip("datasets", reason="datasets is not installed: pip install datasets")
     pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'embomatrix[export]'")
     folder, cache = tmp_path / "export", str(tmp_path / "cache")
-    folder.mkdir()
     done = CliRunner().invoke(
         app, ["export", "--dataset", str(dataset.folder), "--out", str(folder / "tasks.parquet")]
     )
@@ -202,8 +201,8 @@ def test_card_counts_tasks_and_explains_every_field(dataset):
 
 def test_export_writes_the_card_beside_the_file(dataset, tmp_path):
     done = CliRunner().invoke(
-        app, ["export", "--dataset", str(dataset.folder), "--out", str(tmp_path / "tasks.jsonl")]
+        app, ["export", "--dataset", str(dataset.folder), "--out", str(tmp_path / "hub" / "tasks.jsonl")]
     )
     assert done.exit_code == 0, done.output
-    assert (tmp_path / "README.md").read_text().startswith("---\n")
-    assert (tmp_path / "tasks.jsonl").read_text().count("\n") == len(dataset.records)
+    assert (tmp_path / "hub" / "README.md").read_text().startswith("---\n")
+    assert (tmp_path / "hub" / "tasks.jsonl").read_text().count("\n") == len(dataset.records)

@@ -133,6 +133,7 @@ def export(
                 f"{foreign[0]} was not written by an export to {out.name}: name a file in another folder, or pass --force to "
                 "replace it"
             )
+        out.parent.mkdir(parents=True, exist_ok=True)
         write_whole(out, data)
         write_whole(card, dataset_card(found, out.name, data).encode("utf-8"))
     say(f"{len(found.records)} tasks: {out}, card: {card}")
