@@ -52,6 +52,28 @@ def prompts(policy, count=3):
     return [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:count]]
 
 
+REFUSING = "{{ raise_exception('System role not supported') if messages[0].role == 'system' }}"
+EACH = "{% for each in messages %}<{{ each.role }}>{{ each.content }}{% endfor %}<assistant>"
+USERS = EACH.replace("in messages", "in messages if each.role != 'system'")
+
+
+@pytest.mark.parametrize(
+    ("template", "expected"),
+    [
+        (EACH, "<system>{system}<user>{user}<assistant>"),
+        (REFUSING + EACH, "<user>{system}\n\n{user}<assistant>"),  # as Gemma does
+        (USERS, "<user>{system}\n\n{user}<assistant>"),
+    ],
+)
+def test_chat_templates_without_a_system_role_keep_the_system_text(policy, template, expected, monkeypatch):
+    monkeypatch.setattr(policy._tokenizer, "chat_template", template)
+    texts = []
+    monkeypatch.setattr(policy, "_tokens", texts.append)
+    prompt = prompt_for(TASKS.train[0].situation, Codec.LINES)
+    policy.encode(prompt)
+    assert texts == [expected.format(system=prompt.system, user=prompt.user)]
+
+
 def test_shared_prompt_gives_the_log_probabilities_of_a_plain_forward_pass(policy):
     prompt_ids = [prompts(policy)[0][30:], *prompts(policy)[1:]]
     samples = policy.sample(prompt_ids, 3, 1.2, 10, torch.Generator().manual_seed(0))

@@ -133,14 +133,23 @@ class HfPolicy:
     def encode(self, prompt: Prompt) -> Tokens:
         """Apply the chat template if the model has one, else join system text, user text and "Plan:"."""
         if getattr(self._tokenizer, "chat_template", None):
-            messages = [
-                {"role": "system", "content": prompt.system},
-                {"role": "user", "content": prompt.user},
-            ]
-            text = self._tokenizer.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
-        else:
-            text = f"{prompt.system}\n\n{prompt.user}\nPlan:\n"
-        return self._tokens(text)
+            return self._tokens(self._chat(prompt))
+        return self._tokens(f"{prompt.system}\n\n{prompt.user}\nPlan:\n")
+
+    def _chat(self, prompt: Prompt) -> str:
+        """Text of the chat template. A template without a system role gets the system text in the user's message."""
+        from jinja2 import TemplateError
+
+        render = functools.partial(
+            self._tokenizer.apply_chat_template, tokenize=False, add_generation_prompt=True
+        )
+        user = {"role": "user", "content": prompt.user}
+        # Gemma's template refuses the role, and some others leave the message out.
+        with contextlib.suppress(TemplateError):
+            text = str(render([{"role": "system", "content": prompt.system}, user]))
+            if prompt.system.strip() in text:
+                return text
+        return str(render([{**user, "content": f"{prompt.system}\n\n{prompt.user}"}]))
 
     def encode_plan(self, text: str) -> Tokens:
         return (*self._tokens(text), self._end[0])
