@@ -222,9 +222,10 @@ class HfPolicy:
     def _run(self, ids: Tensor, *, keep: int, **inputs: Any) -> Tensor:
         """Hidden states (rows, keep, C) of the last positions, or their scores (rows, keep, V) without a plain head."""
         if self._has_plain_head:
-            states = self.module.get_decoder()(ids, **inputs).last_hidden_state
-            return states[:, -keep:]  # type: ignore[no-any-return]
-        return self.module(ids, logits_to_keep=keep, **inputs).logits  # type: ignore[no-any-return]
+            states: Tensor = self.module.get_decoder()(ids, **inputs).last_hidden_state
+            return states[:, -keep:]
+        scores: Tensor = self.module(ids, logits_to_keep=keep, **inputs).logits
+        return scores
 
     def _states(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
         """States (rows, T, C) before each token (rows, T). The prompt of a group runs once."""
