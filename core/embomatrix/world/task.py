@@ -44,7 +44,8 @@ class Task:
 
     ``goal`` is ground except for its quantifiers, which range over ``types``: object names by synset. ``table`` is the object
     table: a plan's ``object_index`` is a row of it, and its order reveals nothing about the goal. ``goal_bddl`` is the same
-    goal as text. ``source`` is the task's origin ("writer", "behavior-1k", "embomatrix", "file").
+    goal as text. ``source`` is the task's origin ("society", "writer", "behavior-1k", "embomatrix", "eai",
+    "file").
     """
 
     task_id: str

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from embomatrix.sim.caches import RecentCache
 from embomatrix.sim.floor.components import FloorParts, Window, overlap
@@ -330,7 +329,7 @@ def clear_floor(covered: NDArray[np.int16]) -> BoolArray:
         width = columns
         near[rows:] |= spread[: -rows or None]
         near[: -rows or None] |= spread[rows:]
-    return ~near
+    return np.asarray(~near)
 
 
 @functools.cache

@@ -126,7 +126,7 @@ def build(
 def generate(
     out: Out,
     tasks: Annotated[int, typer.Option(min=0, help="Number of training tasks.")] = 480,
-    heldout: Annotated[int, typer.Option(min=0, help="Number of evaluation tasks, in other rooms.")] = 0,
+    heldout: Annotated[int, typer.Option(min=0, help="Number of evaluation tasks, in other scenes.")] = 0,
     seed: Seed = 0,
     scenes: Scenes = None,
     jobs: Jobs = None,
