@@ -283,7 +283,7 @@ def test_interrupted_evaluation_resumes_from_its_answers(kitchen, tmp_path):
             assert_ended(asking.interrupt(), 130, "the same command continues from there")
         server.script = ["move 10"]
         result = run(*arguments, f"--endpoint={url}")
-    assert_ended(result, 0, "2 answers are already stored", "12 answers in", "goal_not_met 12 100.0%")
+    assert_ended(result, 0, "2 answers are already stored", "12 answers in", "goal not met 12 100.0%")
 
 
 def _lines(out):

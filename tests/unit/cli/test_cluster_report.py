@@ -22,7 +22,7 @@ TIMINGS = Timings(queued_s=0.1, load_s=0.0, execute_s=0.5, lease_s=0.01)
 
 
 def summary(**changes):
-    found = PhaseSummary(3, 1.5, 0.5, 0.6, 0.7)
+    found = PhaseSummary(3, 3.0, 0.5, 0.6, 0.7)
     values = {
         "run": RunInfo("r1", "<evening>", STATS, 0, 1_000.0, 1_060.0),
         "phases": dict.fromkeys(RolloutPhase, found),
@@ -32,7 +32,7 @@ def summary(**changes):
             RunEvent(9, 1_010.0, EventKind.FAILED, "r1", "b", "x9", "office", "sha256:0123456789", 1, 2,
                      "slot_crashed", "no <mesh> of 3 \u00b5m"),
         ),
-        "manager_cpu_s": 0.5,
+        "manager_cpu_s": 1.0,
         "prewarm_lead": found,
         "scene_load": PhaseSummary(),
         "events_dropped": 0,
@@ -127,6 +127,7 @@ def test_empty_run_has_a_report():
     assert Outline(page).open == []
     assert "No worker has finished anything." in page
     assert "None: every lease brought a result." in page
+    assert "Manager overhead – share" in " ".join(re.sub(r"<[^>]*>", " ", page).split())
 
 
 def test_leases_that_were_given_again_are_told_where_none_failed():

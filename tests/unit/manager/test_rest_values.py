@@ -72,6 +72,10 @@ def test_health_reports_the_most_important_fact():
 
 def test_failures_are_reported_for_five_minutes():
     assert mood(failures=[NOTE])[1] == "1 rollout failed in the last 5 minutes, with slot_crashed."
+    equal = replace(NOTE, count=4)
+    assert mood(failures=[equal, NOTE])[1].startswith(
+        "5 rollouts failed in the last 5 minutes, the latest with"
+    )
     assert mood(failures=[NOTE] * FAILURES_KEPT)[1].startswith(f"{FAILURES_KEPT} or more rollouts")
     assert mood(failures=[NOTE], now_s=2000.0) == (Mood.GOOD, "All is well.")
 

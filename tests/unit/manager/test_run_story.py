@@ -61,6 +61,16 @@ def test_story_of_a_closed_run_names_time_outcomes_speed_and_scenes():
     ]
 
 
+def test_story_tells_rollouts_that_ended_without_an_attempt_from_failed_attempts():
+    ended = [RunEvent(n, DAY_S, EventKind.ENDED, code="scene_load_failed") for n in range(3)]
+    crashed = RunEvent(9, DAY_S, EventKind.FAILED, code="slot_crashed")
+    stats = RunStats(infra_failures=3)
+    without = run_story(summary(stats=stats, failures=tuple(ended)))
+    assert "Of the latest 3 failed rollouts, 3 had the reason scene_load_failed." in without
+    both = run_story(summary(stats=stats, failures=(*ended, crashed)))
+    assert "One attempt failed, with the reason slot_crashed." in both
+
+
 def test_story_of_an_open_run_without_work_says_what_it_waits_for():
     empty = summary(closed_s=0.0, completed=(), waits_for="no worker is connected")
     assert run_story(empty)[:3] == [

@@ -92,7 +92,6 @@ def _tiles(summary: RunSummary) -> str:
     completed = sum(summary.series.completed)
     active_s = summary.series.step_s * sum(count > 0 for count in summary.series.completed)
     execute = summary.phases[RolloutPhase.EXECUTE]
-    cpu_s = summary.manager_cpu_s + execute.sum_s
     asked = stats.prewarm_hits + stats.prewarm_misses
     tiles = (
         (
@@ -115,7 +114,7 @@ def _tiles(summary: RunSummary) -> str:
         ),
         (
             "Manager overhead",
-            _share(summary.manager_cpu_s, cpu_s),
+            NONE if summary.overhead is None else _share(summary.overhead, 1.0),
             "share of all CPU time, manager and slots",
         ),
     )
@@ -186,18 +185,28 @@ def _failures(summary: RunSummary) -> str:
     if not summary.failures:
         again = summary.run.stats.redispatched
         if again:
+            which = "1 rollout was" if again == 1 else f"{again:,} rollouts were"
+            owner = "its" if again == 1 else "their"
             return (
-                f'<p class="none">No lease failed. {again:,} rollouts were leased again because their worker left, drained or '
+                f'<p class="none">No lease failed. {which} leased again because {owner} worker left, drained or '
                 "fell silent before it had a result.</p>"
             )
         return '<p class="none">None: every lease brought a result.</p>'
     codes = Counter(event.code for event in summary.failures)
-    counts = ", ".join(f"{count} {code}" for code, count in codes.most_common())
+    counts = ", ".join(f"{code} ({count})" for code, count in codes.most_common())
     rows = "".join(map(_failure_row, reversed(summary.failures)))
-    names = ("time", "what", "reason", "attempt", "rollout", "worker", "scene")
+    names = ("time (UTC)", "what", "reason", "attempt", "rollout", "worker", "scene")
     head = "".join(f"<th>{name}</th>" for name in names)
     table = f"<table><tr>{head}</tr>{rows}</table>"
-    return f'<p class="note">The latest {len(summary.failures)}: {escape(counts)}.</p><div class="scroll">{table}</div>'
+    attempts = sum(event.kind is EventKind.FAILED for event in summary.failures)
+    rollouts = len(summary.failures) - attempts
+    kinds = [
+        f"{count:,} failed {noun}{'' if count == 1 else 's'}"
+        for count, noun in ((attempts, "lease"), (rollouts, "rollout"))
+        if count
+    ]
+    latest = f"Latest: {' and '.join(kinds)}, with the reasons {counts}."
+    return f'<p class="note">{escape(latest)}</p><div class="scroll">{table}</div>'
 
 
 def _failure_row(event: RunEvent) -> str:

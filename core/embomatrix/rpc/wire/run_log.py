@@ -6,13 +6,16 @@ Times are seconds since the epoch on the manager's clock. Durations are measured
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.wire.codec import ConvertError, converters, each, enum_numbers, finite, inside
 from embomatrix.rpc.wire.outcome import timings_from_proto, timings_to_proto
 from embomatrix.rpc.wire.session import run_info_from_proto, run_info_to_proto
 from embomatrix.rpc.wire.values import RunInfo, Timings
+
+LEAST_WORK_S: Final = 3.0
+"""Work of all slots below which the manager's share of CPU time says nothing: its idle time would count."""
 
 
 class RolloutPhase(StrEnum):
@@ -108,6 +111,12 @@ class RunSummary:
     scene_load: PhaseSummary
     events_dropped: int
     version: str
+
+    @property
+    def overhead(self) -> float | None:
+        """Manager's share of the CPU time of manager and slots; None if the slots hardly worked."""
+        slots_s = self.phases.get(RolloutPhase.EXECUTE, PhaseSummary()).sum_s
+        return self.manager_cpu_s / (self.manager_cpu_s + slots_s) if slots_s >= LEAST_WORK_S else None
 
 
 class RolloutStepKind(StrEnum):

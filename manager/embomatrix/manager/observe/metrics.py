@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from embomatrix.manager.histogram import Histogram, quantile
+from embomatrix.rpc.wire.run_log import LEAST_WORK_S
 from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure, RolloutResult
 
 WINDOW_S: Final = 60.0
-LEAST_WORK_S: Final = 3.0
-"""Work of all slots in the window below which the manager's share says nothing: its idle time would count."""
 
 
 class _Sample(NamedTuple):
@@ -98,7 +97,7 @@ WORKERS_KEPT: Final = 20_000
 
 @dataclass(frozen=True, slots=True)
 class FailureNote:
-    """Infrastructure failure for the dashboard. ``at_s`` is seconds since the epoch."""
+    """Infrastructure failure for the dashboard. ``at_s`` is seconds since the epoch; ``count`` equal rollouts share it."""
 
     at_s: float
     code: str
@@ -106,6 +105,7 @@ class FailureNote:
     worker_id: str
     run_id: str
     rollout_id: str
+    count: int = 1
 
 
 class Meter:
@@ -116,6 +116,8 @@ class Meter:
 
     def __init__(self) -> None:
         self.outcomes: Counter[str] = Counter()
+        self.failed = 0
+        """Rollouts that ended in an infrastructure failure."""
         self.completed_by: Counter[str] = Counter()
         """Completed rollouts by worker, connected or not."""
         self.failures: deque[FailureNote] = deque(maxlen=FAILURES_KEPT)
@@ -137,7 +139,10 @@ class Meter:
                     del self._per_second[next(iter(self._per_second))]
             case InfraFailure(code, message, worker_id):
                 self.outcomes[code.value] += result.count
-                note = FailureNote(time.time(), code.value, message, worker_id, run_id, result.rollout_id)
+                self.failed += result.count
+                note = FailureNote(
+                    time.time(), code.value, message, worker_id, run_id, result.rollout_id, result.count
+                )
                 self.failures.appendleft(note)
             case Cancelled():
                 self.outcomes["cancelled"] += result.count

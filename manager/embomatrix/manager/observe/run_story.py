@@ -9,7 +9,7 @@ from typing import Final
 
 from embomatrix.manager.observe.run_totals import ENDS, working_s
 from embomatrix.manager.observe.training_reports import Curves, TrainingDetail
-from embomatrix.rpc.wire.run_log import RolloutPhase, RunSummary
+from embomatrix.rpc.wire.run_log import EventKind, RolloutPhase, RunSummary
 
 FEWEST_STEPS: Final = 2
 """Steps from which a curve has two ends."""
@@ -53,14 +53,16 @@ def _outcomes(summary: RunSummary) -> Iterator[str]:
         f"; {_counted(failed, 'rollout')} ended in an infrastructure failure" if failed else "; none failed"
     )
     yield f"{workers} completed {_counted(completed, 'rollout')}{ending}."
-    codes = Counter(event.code for event in summary.failures if event.code).most_common(1)
+    # A rollout whose scene does not load ends without an attempt.
+    attempts = [event for event in summary.failures if event.kind is EventKind.FAILED]
+    found, noun = (attempts, "attempt") if attempts else (summary.failures, "rollout")
+    codes = Counter(event.code for event in found if event.code).most_common(1)
     if codes:
         code, count = codes[0]
-        kept = len(summary.failures)
         yield (
-            f"One attempt failed, with the reason {code}."
-            if kept == 1
-            else f"Of the latest {kept:,} failed attempts, {count:,} had the reason {code}."
+            f"One {noun} failed, with the reason {code}."
+            if len(found) == 1
+            else f"Of the latest {len(found):,} failed {noun}s, {count:,} had the reason {code}."
         )
     if stats.redispatched:
         yield (

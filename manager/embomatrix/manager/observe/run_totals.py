@@ -78,12 +78,10 @@ def _times(summary: RunSummary) -> Iterator[RunTotal]:
 
 def _costs(summary: RunSummary) -> Iterator[RunTotal]:
     stats = summary.run.stats
-    slots_s = summary.phases.get(RolloutPhase.EXECUTE, PhaseSummary()).sum_s
     hits = _share(stats.prewarm_hits, stats.prewarm_hits + stats.prewarm_misses)
-    overhead = _share(summary.manager_cpu_s, summary.manager_cpu_s + slots_s)
     yield RunTotal("prewarm hits", hits, TotalUnit.SHARE, Aim.UP)
     yield RunTotal("shared steps", _share(stats.shared_steps, stats.steps), TotalUnit.SHARE)
-    yield RunTotal("manager overhead", overhead, TotalUnit.SHARE, Aim.DOWN)
+    yield RunTotal("manager overhead", summary.overhead, TotalUnit.SHARE, Aim.DOWN)
 
 
 def _learned(training: TrainingDetail | None) -> Iterator[RunTotal]:

@@ -97,6 +97,8 @@ class Overview:
     """Share of one core that the manager used in the last minute."""
     slots_at_work: float = 0.0
     """Mean number of slots that executed plans in the last minute."""
+    failed: int = 0
+    """Rollouts that ended in an infrastructure failure since the manager started; ``failures`` lists the latest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +242,7 @@ def overview(runtime: ManagerRuntime) -> Overview:
         overhead=runtime.load.overhead(),
         core_share=runtime.load.core_share(),
         slots_at_work=runtime.load.slots_at_work(),
+        failed=meter.failed,
     )
 
 
@@ -372,8 +375,9 @@ def _health_of_work(seen: Overview, working: int, lost: int, now_s: float) -> He
     recent = [note for note in seen.failures if now_s - note.at_s < RECENT_S]
     if recent:
         # The meter keeps no more failures than this.
-        count = f"{len(recent)} or more" if len(recent) == FAILURES_KEPT else f"{len(recent)}"
-        failed, latest = ("rollout", "with") if len(recent) == 1 else ("rollouts", "the latest with")
+        rollouts = sum(note.count for note in recent)
+        count = f"{rollouts} or more" if len(recent) == FAILURES_KEPT else f"{rollouts}"
+        failed, latest = ("rollout", "with") if rollouts == 1 else ("rollouts", "the latest with")
         return Health(
             Mood.WARNING,
             f"{count} {failed} failed in the last {RECENT_S / 60:.0f} minutes, {latest} {recent[0].code}.",

@@ -81,5 +81,6 @@ def picture_section(picture: Picture, title: str) -> str:
     return (
         f'<section class="half plan"><h3>{html.escape(title)}</h3>'
         f'<p><span class="verdict {kind}">{html.escape(outcome)}</span> {html.escape(task.instruction)}</p>'
-        f"{plan_view(picture.scene, task, picture.plan, verdict)}<ol>{''.join(items)}</ol></section>"
+        f'<div class="scroll">{plan_view(picture.scene, task, picture.plan, verdict)}</div>'
+        f"<ol>{''.join(items)}</ol></section>"
     )

@@ -40,7 +40,8 @@ def plan_view(scene: Scene, task: Task, plan: Plan, verdict: AnswerVerdict) -> s
     parts = [
         *(view.box(room.low_m, room.high_m, "room", room.name) for room in scene.rooms),
         *_furniture(scene, view, used),
-        *(view.text(*room.low_m, room.name, 'class="name"', 4, -4) for room in scene.rooms),
+        # Of other rooms only an edge is in the view, which would cut their names off.
+        *(view.text(*room.low_m, room.name, 'class="name"', 4, -4) for room in view.rooms),
         *_labels(scene, view, used),
         view.line([start, *(point for _, point in marks)], "route"),
         f'<circle class="robot" cx="{x}" cy="{y}" r="6"><title>initial position of the robot</title></circle>',

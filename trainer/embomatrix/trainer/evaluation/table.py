@@ -134,7 +134,12 @@ def cause_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         counts = ", ".join(f"{reason} {times}" for reason, times in reasons.items() if reason != name)
         meaning = MEANINGS[Cause(name)]
         rows.append(
-            (name, str(count), f"{count / known:.1%}", f"{meaning} ({counts})" if counts else meaning)
+            (
+                name.replace("_", " "),
+                str(count),
+                f"{count / known:.1%}",
+                f"{meaning} ({counts})" if counts else meaning,
+            )
         )
     return rows
 

@@ -187,7 +187,8 @@ def _held_out_curve(evaluations: Sequence[RecordedEvaluation], tasks: TaskSet) -
     categories = _categories(tasks)
     points = [(each.step, each.board(categories).success().interval) for each in evaluations if each.answers]
     return (
-        f"<section class='curve'><h2>Held-out success during GRPO</h2>{success_curve(points)}</section>"
+        "<section class='curve'><h2>Held-out success during GRPO</h2>"
+        f"<div class='scroll'>{success_curve(points)}</div></section>"
         if len(points) > 2
         else ""
     )
@@ -242,13 +243,13 @@ def _drawn(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _section_of_curve(curve: str) -> str:
-    return f'<section class="half">{curve}</section>'
+    return f'<section class="half"><div class="scroll">{curve}</div></section>'
 
 
 def _times(outcome: RunOutcome) -> str:
     """Table of seconds and shares by activity, with a bar for each share."""
     rows = "".join(
-        f"<tr><td>{html.escape(name)}</td><td>{spent:,.0f} s</td><td>{share:.0%}</td>"
+        f"<tr><td>{html.escape(name)}</td><td>{spent:,.0f}&nbsp;s</td><td>{share:.0%}</td>"
         f'<td><div class="bar"><i style="width:{min(1.0, share):.1%}"></i></div></td></tr>'
         for name, spent, share in time_rows(outcome)
     )

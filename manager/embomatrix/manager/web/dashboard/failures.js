@@ -1,6 +1,6 @@
 // Infrastructure failures: reason, worker, scene, attempt, and the worker's message.
 import {ask} from "./ask.js";
-import {at, clock, count, h, none, put, table} from "./dom.js";
+import {at, clock, count, counted, h, none, put, table} from "./dom.js";
 import {named, worded} from "./names.js";
 
 const BAD = ["failed", "worker_lost", "scene_failed"];
@@ -12,18 +12,23 @@ let log = [], after = 0, looks = 0, lost = [];
 export function open(main) {
   log = []; after = 0; looks = 0; lost = [];
   main.replaceChildren(
-    h("section", {class: "half"}, h("h2", {}, "By reason"), h("div", {id: "reasons"})),
-    h("section", {class: "half"}, h("h2", {}, "By worker"), h("div", {id: "blamed"})),
-    h("section", {}, h("h2", {}, "Failed rollouts ", h("small", {}, "infrastructure failures, never scored as a reward")), h("div", {id: "failures"})),
-    h("section", {}, h("h2", {}, "Failed attempts ", h("small", {}, "failed leases, scenes and lost workers: their rollouts were re-dispatched")), h("div", {id: "attempts"})));
+    h("section", {}, h("h2", {}, "Since the manager started"), h("p", {id: "sum"})),
+    h("section", {class: "half"}, h("h2", {}, "By reason ", h("small", {}, "all failed rollouts, and the attempts below")), h("div", {id: "reasons"})),
+    h("section", {class: "half"}, h("h2", {}, "By worker ", h("small", {}, "of the rollouts and attempts below")), h("div", {id: "blamed"})),
+    h("section", {}, h("h2", {}, "Failed rollouts ", h("small", {id: "listed"})), h("div", {id: "failures"})),
+    h("section", {}, h("h2", {}, "Failed attempts ", h("small", {}, "latest failed leases of open runs, failed scenes and lost workers: their rollouts were re-dispatched")), h("div", {id: "attempts"})));
 }
 
 export async function show({overview, runs}) {
   const given = overview.failures;
   if (looks++ % LOOK_EVERY === 0) lost = await look(runs);
-  put(at("reasons"), tally("reason", given.map(note => note.code), lost.map(event => event.code || event.kind)));
-  put(at("blamed"), tally("worker", given.map(note => note.worker_id || "none"), lost.map(event => event.worker_id || "none")));
-  const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id), h("td", {class: "message"}, worded(note.message))));
+  const ended = Object.entries(overview.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled"), attempts = lost.map(event => [event.code || event.kind, 1]);
+  put(at("sum"), `${counted(overview.failed, "rollout")} ended in an infrastructure failure, which is never scored as a reward. ${counted(overview.redispatched, "rollout")} ${overview.redispatched === 1 ? "was" : "were"} re-dispatched after a lease that failed or expired.`);
+  put(at("reasons"), tally("reason", ended, attempts));
+  put(at("blamed"), tally("worker", given.map(note => [note.worker_id || "none", note.count]), lost.map(event => [event.worker_id || "none", 1])));
+  const listed = given.reduce((sum, note) => sum + note.count, 0);
+  at("listed").textContent = listed < overview.failed ? `the latest ${count(listed)} of ${count(overview.failed)}` : "";
+  const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id, note.count > 1 && h("span", {class: "muted"}, ` and ${counted(note.count - 1, "equal one")}`)), h("td", {class: "message"}, worded(note.message))));
   put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "message"], rows, "failures", "loose") : none("None. A rollout counts as failed only after its last attempt."));
   const every = fold(lost);
   const folded = every.slice(0, ROWS).map(({event, times}) =>
@@ -53,9 +58,10 @@ function fold(events) {
   return [...rows.values()];
 }
 
-function tally(heading, given, lost) {
+/** Table of numbers of rollouts and attempts by name, from pairs of a name and a number. */
+function tally(heading, ended, lost) {
   const counts = {};
-  for (const [i, names] of [given, lost].entries()) for (const name of names) (counts[name] ??= [0, 0])[i] += 1;
+  for (const [i, pairs] of [ended, lost].entries()) for (const [name, n] of pairs) (counts[name] ??= [0, 0])[i] += n;
   const rows = Object.entries(counts).sort(([, a], [, b]) => b[0] - a[0] || b[1] - a[1]).map(([name, numbers]) => h("tr", {}, h("td", {class: "named"}, h("code", {}, name)), numbers.map(n => h("td", {class: "n"}, count(n)))));
-  return rows.length ? table([heading, ["rollouts", "n"], ["attempts", "n"]], rows, `latest failures by ${heading}`) : none("None.");
+  return rows.length ? table([heading, ["rollouts", "n"], ["attempts", "n"]], rows, `failures by ${heading}`) : none("None.");
 }

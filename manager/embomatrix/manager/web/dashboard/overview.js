@@ -27,18 +27,17 @@ export function close() {
 
 export function show({overview: o, runs}) {
   const recent = o.throughput.slice(-10), mean = recent.reduce((a, b) => a + b, 0) / recent.length;
-  const failed = Object.entries(o.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled").reduce((sum, [, n]) => sum + n, 0);
   const texts = {
     rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: o.latency_p95_s ? `median; 95th percentile ${seconds(o.latency_p95_s)}` : "from submission to result",
     overheadnote: `manager's share of CPU time; ${share(o.core_share, 1)} of its core`,
     overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)}\u00a0%` : "–",
     hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: o.prewarm_hits ? `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted` : "of announced scenes",
     slots: `${o.slots_at_work.toFixed(1)}/${o.slots}`, slotsnote: `mean of a minute; ${count(o.queued)} rollouts queued`,
-    bad: count(failed), badnote: `${count(o.redispatched)} re-dispatched, ${count(o.stale_results)} late`,
+    bad: count(o.failed), badnote: `${count(o.redispatched)} re-dispatched, ${count(o.stale_results)} late`,
     peak: `peak ${count(Math.max(...o.throughput))}, ${count(o.outcomes.completed || 0)} in total`,
   };
   for (const [id, text] of Object.entries(texts)) at(id).textContent = text;
-  at("bad").className = failed ? "bad" : "";
+  at("bad").className = o.failed ? "bad" : "";
   const ago = o.throughput.map((_, i) => i - o.throughput.length + 1);
   drawn.draw(ago, [o.throughput.map((done, i) => -ago[i] > o.uptime_s ? null : done)]);
   put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["shared", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));

@@ -1,5 +1,5 @@
 // Parts that several pages show: totals of a run, durations by phase, failures, and sampled plans.
-import {count, h, none, seconds, share, signed, stamp, table} from "./dom.js";
+import {count, counted, h, none, seconds, share, signed, stamp, table} from "./dom.js";
 import {named, worded} from "./names.js";
 
 const PHASES = {queue: "waiting for a lease", lease: "network and waiting for a slot", load: "loading the scene", execute: "executing the plan", deliver: "writing the result"};
@@ -23,16 +23,23 @@ export function phaseTable(durations) {
 }
 
 /** Failed leases and rollouts of a run, the latest first, with their number by reason. */
-export function failureParts(events) {
-  if (!events.length) return [none("None: every lease brought a result.")];
+export function failureParts(events, redispatched) {
+  const again = `${counted(redispatched, "rollout")} ${redispatched === 1 ? "was" : "were"} leased again because ${redispatched === 1 ? "its" : "their"} worker left, drained or fell silent before it had a result.`;
+  if (!events.length) return [none(redispatched ? `No lease failed. ${again}` : "None: every lease brought a result.")];
   const reasons = {};
   for (const {code} of events) reasons[code] = (reasons[code] ?? 0) + 1;
-  const counts = Object.entries(reasons).sort((a, b) => b[1] - a[1]).map(([code, n]) => events.length === 1 ? code : `${count(n)} ${code}`).join(", ");
+  const counts = Object.entries(reasons).sort((a, b) => b[1] - a[1]).map(([code, n]) => `${code} (${count(n)})`).join(", ");
   const rows = events.slice(-MESSAGES).reverse().map(event => h("tr", {}, h("td", {class: "muted fit"}, stamp(event.at_s)), h("td", {class: "fit"}, event.kind === "failed" ? "attempt" : "rollout"),
     h("td", {class: "fit"}, h("code", {class: "bad"}, event.code)), h("td", {class: "named"}, event.worker_id ?? ""), h("td", {class: "named"}, event.rollout_id ?? ""),
     h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "message"}, worded(event.message ?? ""))));
-  return [h("p", {}, `${events.length === 1 ? "One failure" : `The latest ${count(events.length)} failures`}: ${counts}.`), table(["when", "failed", "reason", "worker", "rollout", "scene", "message"], rows, "failures", "loose"),
+  return [h("p", {}, `Latest: ${latestFailures(events)}, with the reasons ${counts}.`), table(["when", "failed", "reason", "worker", "rollout", "scene", "message"], rows, "failures", "loose"),
     events.length > MESSAGES ? none(`The table shows the last ${MESSAGES}.`) : ""];
+}
+
+/** Numbers of failed attempts and failed rollouts in a list of events. */
+function latestFailures(events) {
+  const attempts = events.filter(event => event.kind === "failed").length, rollouts = events.length - attempts;
+  return [attempts && counted(attempts, "failed attempt"), rollouts && counted(rollouts, "failed rollout")].filter(Boolean).join(" and ");
 }
 
 const points = number => signed(number.toFixed(2));

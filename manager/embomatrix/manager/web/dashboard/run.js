@@ -61,9 +61,9 @@ function draw(others) {
   const all_s = workers.reduce((sum, worker) => sum + worker.execute_s, 0);
   const rows = [...workers].sort((a, b) => b.completed - a.completed).map(worker => h("tr", {}, h("td", {class: "named"}, worker.worker_id), h("td", {class: "n"}, count(worker.completed)),
     h("td", {class: worker.failed ? "n bad" : "n"}, count(worker.failed)), h("td", {class: "n"}, share(worker.execute_s, all_s))));
-  put(at("work"), rows.length ? table(["worker", ["done", "n"], ["failed", "n"], ["share", "n"]], rows, "work by worker") : none("No worker has finished anything."));
+  put(at("work"), rows.length ? table(["worker", ["completed", "n"], ["failed", "n"], ["share", "n"]], rows, "work by worker") : none("No worker has finished anything."));
   put(at("phases"), phaseTable(phases));
-  put(at("lost"), ...failureParts(failures));
+  put(at("lost"), ...failureParts(failures, run.stats.redispatched));
   learned();
 }
 
