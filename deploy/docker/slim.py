@@ -2,7 +2,8 @@
 
 PyBullet's wheel carries 130 MB of debugging symbols and many robot models, of which one arm is used here.
 
-Usage, with the environment's Python: slim.py MODULE [MODULE ...], where the modules are those that the service imports.
+Usage, with the environment's Python: slim.py [--keep-samples] MODULE [MODULE ...], where the modules are those that the service
+imports. With --keep-samples, the shipped tasks, the shipped policy and the workloads of benchmarks stay.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ NEVER_READ: Final = (
     "torch/test",
     "**/*.pyc",
 )
+SAMPLES: Final = ("embomatrix/bench/data", "embomatrix/starter/policy", "embomatrix/starter/*.xz")
 STRIPPED: Final = ("pybullet*.so", "grpc/**/*.so", "cryptography/**/*.so")
 """Libraries with symbols. Stripping breaks the libraries in ``*.libs`` folders, which were edited after linking."""
 ARM: Final = "franka_panda"
@@ -40,9 +42,9 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def slim(packages: Path) -> None:
+def slim(packages: Path, unused: tuple[str, ...]) -> None:
     """Remove unused files below the folder of installed packages, and strip its libraries."""
-    for pattern in NEVER_READ:
+    for pattern in unused:
         for path in sorted(packages.glob(pattern)):
             _remove(path)
     models = packages / "pybullet_data"
@@ -56,6 +58,8 @@ def slim(packages: Path) -> None:
 
 
 if __name__ == "__main__":
-    slim(Path(sysconfig.get_path("purelib")))
-    for name in sys.argv[1:]:
+    names = [argument for argument in sys.argv[1:] if argument != "--keep-samples"]
+    kept = len(names) < len(sys.argv) - 1
+    slim(Path(sysconfig.get_path("purelib")), NEVER_READ if kept else (*NEVER_READ, *SAMPLES))
+    for name in names:
         importlib.import_module(name)

@@ -9,6 +9,7 @@ from tests.fakes.browser import shown
 from tests.fakes.commands import background
 from tests.integration.test_manager_service import manager
 
+from embomatrix.manager.web.gallery import no_tasks_yet
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.wire.training import RewardTiers, SampledPlan, SampledStep, TrainingReport
 from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout
@@ -131,6 +132,13 @@ async def test_task_page_without_dataset_shows_the_option(browser, tmp_path):
     async with manager(tmp_path / "data") as at:
         page = await asyncio.to_thread(shown, browser, f"{at.status_url}#tasks", tmp_path)
     assert page.words["cards"] == "no dataset is shown: start the manager with --dataset FOLDER"
+
+
+async def test_task_page_of_an_empty_folder_says_how_to_fill_it(browser, tmp_path):
+    (tmp_path / "empty").mkdir()
+    async with manager(tmp_path / "data", dataset=tmp_path / "empty") as at:
+        page = await asyncio.to_thread(shown, browser, f"{at.status_url}#tasks", tmp_path)
+    assert page.words["cards"] == no_tasks_yet(tmp_path / "empty")
 
 
 async def test_unknown_page_says_so(browser, tmp_path):

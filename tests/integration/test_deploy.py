@@ -1,5 +1,6 @@
 """Deployment files are valid and confined, and name existing commands, options and metrics."""
 
+import importlib.metadata
 import json
 import os
 import re
@@ -109,14 +110,58 @@ def test_systemd_accepts_the_manager_unit(tmp_path):
 
 
 def test_manager_image_contains_all_imported_packages():
-    built = (DEPLOY / "docker" / "Dockerfile").read_text()
-    (lacked,) = re.findall(r"pyproject\.toml manager \| grep -v \^(\w+)", built)
+    built = (DEPLOY / "docker" / "Dockerfile").read_text().replace("\\\n", " ")
     (modules,) = re.findall(r"slim\.py (.*embomatrix\.manager\.services\.app.*)", built)
-    asked = f"import importlib, sys\nsys.modules[{lacked!r}] = None\nfor name in sys.argv[1:]: importlib.import_module(name)"
+    lacked = packages_of("worker", "factory", "trainer") - packages_of("manager")
+    assert {"pybullet", "scipy", "torch"} <= lacked
+    hidden = f"import importlib, sys\nsys.modules.update(dict.fromkeys({sorted(lacked)}))"
+    asked = f"{hidden}\nfor name in sys.argv[1:]: importlib.import_module(name)"
     ran = subprocess.run(
         (sys.executable, "-c", asked, *modules.split()), capture_output=True, text=True, check=False
     )
     assert ran.returncode == 0, ran.stderr
+
+
+def packages_of(*extras):
+    """Return the import names of the installed requirements of extras."""
+    command = (sys.executable, DEPLOY / "docker" / "requirements.py", ROOT / "pyproject.toml", *extras)
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    wanted = {re.match(r"[\w-]+", line).group().lower() for line in lines}
+    found = importlib.metadata.packages_distributions()
+    return {name for name, owners in found.items() if wanted & {owner.lower() for owner in owners}}
+
+
+def local_bases(folder, docker):
+    """Run the script as a user without root and debootstrap; ``docker`` is a shell script in place of the engine's client."""
+    for name, script in (("docker", docker), ("id", "echo 1000")):
+        (folder / name).write_text(f"#!/bin/sh\n{script}\n")
+        (folder / name).chmod(0o755)
+    return subprocess.run(
+        (DEPLOY / "docker" / "local_bases.sh",),
+        env={"PATH": f"{folder}:/usr/bin:/bin", "TMPDIR": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_script_of_base_images_says_what_it_needs_before_it_pulls(tmp_path):
+    asked = tmp_path / "pulled"
+    done = local_bases(tmp_path, f"case $1 in info) ;; pull) echo $3 >> {asked}; exit 1;; *) exit 1;; esac")
+    needs, _, refusal = (done.stdout + done.stderr).partition("local_bases.sh needs")
+    assert (done.returncode, asked.read_text()) == (2, "python:3.11-slim-bookworm\n")
+    assert "missing  root, for debootstrap: run it with sudo" in needs
+    assert "missing  debootstrap: apt-get install debootstrap" in needs
+    assert f"there    500 MB free in {tmp_path}" in needs
+    assert "what is missing above, because no registry has python:3.11-slim-bookworm" in refusal
+
+
+def test_script_of_base_images_asks_for_an_engine_and_leaves_present_images_alone(tmp_path):
+    without_engine = local_bases(tmp_path, "exit 1")
+    assert without_engine.returncode == 2
+    assert "needs a running Docker engine" in without_engine.stderr
+    present = local_bases(tmp_path, 'case $1 in info|image) ;; *) echo "not expected: $*" >&2; exit 1;; esac')
+    assert (present.returncode, present.stdout) == (0, "local_bases.sh: both base images are there\n")
 
 
 @pytest.mark.parametrize("name", ["prometheus/rules.yml", "grafana/dashboard.json"])

@@ -14,6 +14,7 @@ from tests.fakes.guarded import (
     guarded,
 )
 
+from embomatrix.manager.commands.next_steps import host_steps
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.trust import Invitation, fingerprint_of
 from embomatrix.rpc.wire.tokens import AccessRole
@@ -36,7 +37,15 @@ def test_init_files_are_private_and_never_overwritten(tmp_path):
     result = run("manager", "init", f"--data-dir={tmp_path}", "--san=lab.example", "--san=10.1.2.3")
     assert result.status == 0, result.text
     assert "lab.example" in result.text
-    assert f"next embomatrix manager serve --data-dir={tmp_path}" in result.text
+    steps = [part.partition(": ")[2] for part in result.text.split(" next ")[1:]]
+    assert steps == [step.command for step in host_steps(tmp_path, named=True)]
+    assert [step.split(" --")[0] for step in steps] == [
+        "embomatrix factory starter",
+        "embomatrix manager serve",
+        "embomatrix doctor",
+        "embomatrix train",
+    ]
+    assert f"embomatrix manager serve --data-dir={tmp_path} --dataset=build/dataset" in steps
     files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in files}
     assert {name for name, mode in modes.items() if mode != 0o600} == {"ca.pem", "server.pem"}

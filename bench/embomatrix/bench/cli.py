@@ -203,14 +203,16 @@ def first_hour(
 
 def _trainer_image() -> list[Figure]:
     """Return the size of the trainer's image; none with a note if it is not built."""
-    from embomatrix.bench.operations.compose import compose_at, image_sizes, missing_images
+    from embomatrix.bench.operations.compose import compose_at, image_sizes
 
-    if compose_at(Path()) is None or missing_images():
+    sizes = image_sizes() if compose_at(Path()) else ()
+    found = [figure for figure in sizes if figure.name == "image_trainer_mb"]
+    if not found:
         _note(
-            "image_trainer_mb is left out: it needs a Docker engine, the checkout, and `docker compose build`"
+            "image_trainer_mb is left out: it needs a Docker engine, the checkout, "
+            "and `docker compose --profile trainer build`"
         )
-        return []
-    return [figure for figure in image_sizes() if figure.name == "image_trainer_mb"]
+    return found
 
 
 @app.command()

@@ -12,7 +12,7 @@ from tests.fakes.tiny_scene import tiny_task
 from tests.fuzz.worst_bundle import bundle_with
 
 from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
-from embomatrix.manager.web.gallery import Gallery
+from embomatrix.manager.web.gallery import Gallery, no_tasks_yet
 from embomatrix.manager.web.gallery_values import SceneName
 from embomatrix.manager.web.rest import answer_errors
 from embomatrix.manager.web.rest_tasks import NO_DATASET, task_routes
@@ -127,6 +127,26 @@ async def test_missing_or_damaged_dataset_is_reported(folder, tmp_path):
     (folder / "tasks.jsonl").write_text("{}\n")
     with pytest.raises(UnavailableError, match=r"tasks\.jsonl:1 is damaged"):
         await gallery.page(**EVERY)
+
+
+async def test_dataset_is_shown_from_the_moment_that_its_records_are_there_until_they_are_gone(folder):
+    records = folder / "tasks.jsonl"
+    written = records.rename(folder / "elsewhere.jsonl")
+    gallery = Gallery(folder)
+    page = await gallery.page(**EVERY)
+    assert (page.total, page.items, page.scenes, page.notice) == (0, [], [], no_tasks_yet(folder))
+    assert f"factory starter --out={folder}" in page.notice
+    assert await gallery.scenes(offset=0, limit=9) == []
+    with pytest.raises(NotFoundError, match="no task 'tidy'"):
+        await gallery.detail("tidy")
+    written.rename(records)
+    page = await gallery.page(**EVERY)
+    assert (page.total, page.notice) == (3, "")
+    assert (await gallery.detail("tidy")).floor.rooms
+    records.unlink()
+    assert (await gallery.page(**EVERY)).notice == no_tasks_yet(folder)
+    with pytest.raises(NotFoundError, match="no task of the dataset"):
+        await gallery.floor(digest_of(folder))
 
 
 async def test_memory_of_a_dataset_with_hostile_bundles_is_bounded(tmp_path):

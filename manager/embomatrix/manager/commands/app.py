@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from embomatrix.rpc.admin_client import AdminClient
 
 app = command_group(help="Serve a manager, create its certificates, and manage its tokens.")
+
+logger = logging.getLogger(__name__)
 
 token_app = command_group(help="Issue, list and revoke tokens.")
 app.add_typer(token_app, name="token")
@@ -80,16 +83,23 @@ def serve(
 
 
 def _check_dataset(folder: Path | None) -> None:
-    """Refuse a dataset that can't be shown, before anything is served."""
+    """Refuse a dataset whose folder is missing, and log why a folder's tasks can't be shown yet.
+
+    The manager starts nevertheless, because the dataset may be written or repaired while it serves.
+    """
     if folder is None:
         return
-    # The image of a manager without a dataset has no numpy, which bundles need.
-    from embomatrix.world.dataset import Dataset, DatasetError
+    # Imported here: a manager without a dataset saves the 13 MB of memory that numpy and the code of scenes take.
+    from embomatrix.manager.web.gallery import no_tasks_yet
+    from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 
     try:
         Dataset.load(folder)
     except DatasetError as error:
-        _refuse(str(error))
+        if not folder.is_dir():
+            _refuse(str(error))
+        there = (folder / TASKS_FILE).exists()
+        logger.warning("%s", error if there else no_tasks_yet(folder))
 
 
 add_settings(serve, ManagerSettings, skip=ManagerSettings.model_fields.keys() - OPTIONS)
@@ -112,9 +122,16 @@ def init(
             show_default=False,
         ),
     ] = None,
+    compose: Annotated[
+        bool, typer.Option("--compose", help="Name the next commands as Docker Compose runs them.")
+    ] = False,
 ) -> None:
-    """Create certificates and first tokens for a manager that other machines reach. Existing files stay."""
+    """Create certificates and first tokens for a manager that other machines reach. Existing files stay.
+
+    The last lines name the next commands: serve, write tasks, train, and find the results.
+    """
     from embomatrix.manager.access.folder import FIRST_ROLES, AccessError, hand_out_to, prepare
+    from embomatrix.manager.commands.next_steps import COMPOSE_STEPS, host_steps
 
     folder = _settings({"data_dir": data_dir}).data_dir
     recipients = [_recipient(text) for text in hand_out or ()]
@@ -129,8 +146,8 @@ def init(
         print(f"made   {sentence}")
     for sentence in done.found:
         print(f"there  {sentence}")
-    option = f" --data-dir={folder}" if data_dir is not None else ""
-    print(f"next   embomatrix manager serve{option}, then `embomatrix doctor` on another machine")
+    for step in COMPOSE_STEPS if compose else host_steps(folder, named=data_dir is not None):
+        print(f"next   {step.purpose}: {step.command}")
 
 
 def _recipient(text: str) -> tuple[AccessRole, Path]:

@@ -1,4 +1,4 @@
-"""Tasks of a dataset for the dashboard. The dataset is only read.
+"""Tasks of a dataset for the dashboard. The dataset is only read, and may be written after the manager started.
 
 Names in a dataset are untrusted. Only plain names become paths, links must stay within the folder, and file sizes are
 limited.
@@ -44,8 +44,19 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
 _JPEG: Final = b"\xff\xd8\xff"
 
 
+def no_tasks_yet(folder: Path) -> str:
+    """Return the sentence for a dataset's folder that holds no tasks."""
+    return (
+        f"{folder} holds no tasks yet: the dashboard shows them once {TASKS_FILE} is there; "
+        f"`embomatrix factory starter --out={folder}` writes the shipped ones"
+    )
+
+
 class Gallery:
-    """Tasks of the dataset in ``folder``. Reads run in a thread, one at a time."""
+    """Tasks of the dataset in ``folder``. Reads run in a thread, one at a time.
+
+    A folder without ``tasks.jsonl`` has no tasks until the file appears. A changed file is read again.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -77,6 +88,7 @@ class Gallery:
             [self._card(record) for record in found[offset : offset + limit]],
             [SceneCount(name, number) for name, number in sorted(scenes.items())],
             sorted({record.task.category.value for record in records}),
+            "" if records else no_tasks_yet(self._folder),
         )
 
     async def scenes(self, *, offset: int, limit: int) -> list[SceneName]:
@@ -133,6 +145,9 @@ class Gallery:
                 self._held = None
                 self._floor.cache_clear()
         except OSError as error:
+            if isinstance(error, FileNotFoundError) and self._folder.is_dir():
+                self._stamp, self._records = None, {}
+                return self._records
             raise UnavailableError(
                 f"the dataset {self._folder} can't be read ({error.strerror}): start the manager with another --dataset"
             ) from error

@@ -4,9 +4,9 @@ import {at, categoryWords, count, counted, decoded, h, none, put, splitWords} fr
 import {drawn} from "./plan.js";
 import * as task from "./task.js";
 
-const CARDS = 24, TYPING_MS = 250;
+const CARDS = 24, TYPING_MS = 250, AGAIN_MS = 5000;
 const filters = {search: "", scene: "", category: "", offset: 0};
-let pictures = new Map(), watcher = null, typed = 0, total = 0;
+let pictures = new Map(), watcher = null, typed = 0, again = 0, total = 0;
 
 export function open(main) {
   const chosen = location.hash.split("?")[1];
@@ -30,6 +30,7 @@ export function open(main) {
 export function close() {
   task.close();
   clearTimeout(typed);
+  clearTimeout(again);
   watcher?.disconnect();
   watcher = null;
 }
@@ -39,12 +40,17 @@ export function show() {}
 
 async function turn(changes) {
   Object.assign(filters, {offset: 0}, changes);
+  let shown = false;
   try {
     const page = await ask(`tasks?${new URLSearchParams({...filters, limit: CARDS})}`);
     if (watcher) list(page);
+    shown = !page.notice;
   } catch (error) {
     if (watcher) put(at("cards"), refused(error));
   }
+  clearTimeout(again);
+  // A dataset may be written while the page is open.
+  if (watcher && !shown) again = setTimeout(() => turn({offset: filters.offset}), AGAIN_MS);
 }
 
 function list(page) {
