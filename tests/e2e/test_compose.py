@@ -164,6 +164,8 @@ def test_trainer_container_trains_on_tasks_built_in_a_container(cluster, tmp_pat
     assert sum(worker["completed"] for worker in cluster.status("/api/v1/workers")["items"]) > 0, (
         "no container executed anything"
     )
-    packed = _compose("run", "--rm", "-T", "--no-deps", "--entrypoint=tar", "trainer", "-cC", "/", "runs", text=False)
+    packed = _compose(
+        "run", "--rm", "-T", "--no-deps", "--entrypoint=tar", "trainer", "-cC", "/", "runs", text=False
+    )
     subprocess.run(("tar", "-xo"), input=packed.stdout, cwd=tmp_path, check=True)
     assert (tmp_path / "runs" / "check" / "report.html").is_file()
