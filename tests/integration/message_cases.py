@@ -552,6 +552,36 @@ COMMANDS = (
         "name another path",
     ),
     CommandCase(
+        "file to write below a file",
+        "factory verify --dataset=KITCHEN --json=FILES/file/figures.json",
+        "FILES/file is a file",
+        "name another path",
+    ),
+    CommandCase(
+        "file to write is a folder",
+        "factory prompts --dataset=KITCHEN --out=FILES/empty",
+        "FILES/empty can't be written (Is a directory)",
+        "name another path",
+    ),
+    CommandCase(
+        "file to write on a pseudo file system",
+        "bench engine --json=/proc/figures.json",
+        "/proc/figures.json can't be written",
+        "name another path",
+    ),
+    CommandCase(
+        "record of a run below a file",
+        "train --dataset=KITCHEN --out=FILES/new --record=FILES/file/record.jsonl",
+        "FILES/file is a file",
+        "name another path",
+    ),
+    CommandCase(
+        "evaluation into a folder below a file",
+        "eval --baseline=random --dataset=KITCHEN --out=FILES/file/out",
+        "FILES/file is a file",
+        "name another path",
+    ),
+    CommandCase(
         "evaluation without ledger",
         "factory evaluate admission --dataset KITCHEN",
         "KITCHEN",

@@ -31,7 +31,7 @@ from embomatrix.bench.report.output import console, errors, hand_in, refusals, w
 from embomatrix.bench.report.page import check_page, render_page
 from embomatrix.host.code_version import commit_here
 from embomatrix.host.commands import command_group
-from embomatrix.host.own_files import Force, keep_foreign
+from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.pages.figures import Figure
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
@@ -78,7 +78,7 @@ QUICK = FidelitySettings(plans=24, calls=0, seed=0)
 @app.command()
 def engine(dataset: DataSet = PINNED, json_file: Json = None, cycles: Cycles = 2000) -> None:
     """Measure loading, executing and resetting on one core."""
-    with refusals():
+    with refusals(json_file):
         hand_in(_engine(load_workload(dataset), cycles), json_file)
 
 
@@ -91,7 +91,7 @@ def cluster(
     limit_s: LimitS = 120.0,
 ) -> None:
     """Measure the paper's ablation, the manager under load, look-ahead, and other libraries on the same work."""
-    with refusals():
+    with refusals(json_file):
         hand_in(_cluster(load_workload(dataset), part, naive, limit_s), json_file)
 
 
@@ -108,7 +108,7 @@ def simulation(
     def measure(on_step: OnStep) -> Sequence[Figure]:
         return list(SimulationBench(on_step).figures(most_workers))
 
-    with refusals():
+    with refusals(json_file):
         hand_in(_measured("simulation", measure, most_workers=most_workers), json_file)
 
 
@@ -128,7 +128,7 @@ def trainer(
     """Measure a GRPO step, the time shares of a short run, and an evaluation of stored answers."""
     from embomatrix.bench.trainer.measure import bench_trainer
 
-    with refusals():
+    with refusals(json_file):
         hand_in(_measured("trainer", lambda on_step: bench_trainer(dataset, trl, on_step)), json_file)
 
 
@@ -141,7 +141,7 @@ def operations(
 
     Parts that need Docker or Chromium are left out with a note if these are missing.
     """
-    with refusals():
+    with refusals(json_file):
         workload = load_workload(dataset)
         hand_in(_measured("operations", lambda on_step: _operations(workload, on_step)), json_file)
 
@@ -195,7 +195,7 @@ def first_hour(
             _note("wheel_first_plan_s is left out: it needs the checkout as working folder")
         return [*figures, *_trainer_image()]
 
-    with refusals():
+    with refusals(json_file, record):
         hand_in(_measured("first-hour", measure), json_file)
         for note in notes:
             console.print(note, highlight=False)
@@ -220,7 +220,7 @@ def pictures(json_file: Json = None) -> None:
     """Measure the CPU time of pictures of base scenes; needs no dataset."""
     from embomatrix.bench.pictures.renders import bench_renders
 
-    with refusals():
+    with refusals(json_file):
         hand_in(_measured("pictures", bench_renders), json_file)
 
 
@@ -257,7 +257,7 @@ def traffic(
         raise typer.BadParameter(
             "--dataset is the dataset of a --record: give both, or neither for the shipped sample"
         )
-    with refusals():
+    with refusals(json_file):
         found = (
             sampled_traffic() if record is None else recorded_traffic(record, dataset or default_dataset())
         )
@@ -302,7 +302,7 @@ def adversary(
     def measure(on_step: OnStep) -> Sequence[Figure]:
         return (*bench_adversary(found, siege, on_step), *hunt_shortcuts(hunt, on_step))
 
-    with refusals():
+    with refusals(json_file):
         found = load_workload(dataset)
         hand_in(_measured("adversary", measure), json_file)
 
@@ -330,7 +330,7 @@ def fidelity(
     ] = False,
 ) -> None:
     """Run the same plans in cached and in physical mode and compare; resumes an interrupted suite."""
-    with refusals():
+    with refusals(json_file):
         found = Dataset.load(dataset or (PINNED if quick else FULL_SUITE))
         settings = QUICK if quick else FidelitySettings(plans, calls, seed)
         folder = out or Path("build/fidelity-quick" if quick else "build/fidelity")
@@ -385,6 +385,8 @@ def everything(
         check_page(_text_of(out))
         if json_dir is not None:
             keep_foreign("bench", [json_dir / f"{name}.json" for name in ALL], RESULT_MARK, force=force)
+            prepare_output("bench", *(json_dir / f"{name}.json" for name in ALL))
+        prepare_output("bench", out)
         found = load_workload(dataset)
         results = [_engine(found, cycles), _cluster(found, part, naive, limit_s)]
         for result in results:
@@ -399,7 +401,7 @@ def page(
     out: PageFile = PAGE,
 ) -> None:
     """Render the page from figures that were measured before."""
-    with refusals():
+    with refusals(out):
         results = merge_parts([read_result(file) for file in files])
         write(out, render_page(results, _text_of(out)))
         console.print(f"wrote {out}", highlight=False)

@@ -21,9 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from embomatrix.host.failure import INTERRUPTED, fail
+from embomatrix.host.failure import INTERRUPTED, fail, unwritable
 from embomatrix.host.limits import usable_cores
-from embomatrix.host.own_files import is_own
+from embomatrix.host.own_files import is_own, prepare_output
 from embomatrix.host.printable import printable
 from embomatrix.rpc.options import Ca, Token, add_settings, given_options
 from embomatrix.skills.parse import plan_to_json
@@ -392,7 +392,8 @@ def _judge_stored(
 
 
 def _check_reports(folder: Path) -> None:
-    """Raise TrainerError if a report would replace a file that no evaluation wrote."""
+    """Make the folder of the reports. Raise TrainerError if one would replace a file that no evaluation wrote."""
+    prepare_output("eval", *(folder / name for name in REPORTS))
     if is_own(folder / FILE, HEADER) or is_own(folder / REPORTS[0], REPORT_MARK):
         return
     if found := [folder / name for name in REPORTS if (folder / name).exists()]:
@@ -418,10 +419,9 @@ def _judge(
 
 def _write(path: Path, text: str) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, text.encode("utf-8"))
     except OSError as error:
-        raise TrainerError(f"{path} can't be written ({error.strerror}): pass another --out") from error
+        raise TrainerError(unwritable(path, error)) from error
 
 
 @contextlib.contextmanager

@@ -18,6 +18,7 @@ from embomatrix.cli.play_by_hand import play_by_hand
 from embomatrix.envs.episode import Episode
 from embomatrix.factory.commands.terminal import counter, fail, user_errors
 from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
+from embomatrix.host.own_files import prepare_output
 from embomatrix.host.printable import printable
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score, unparsable
@@ -39,7 +40,6 @@ from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset, TaskRecord
 from embomatrix.world.evaluate import GoalError
 from embomatrix.world.task import Task
-from embomatrix.world.whole_file import check_writable
 
 NO_PLAN: Final = 1
 
@@ -105,7 +105,7 @@ def play(
         if film is not None:
             # Drawing takes minutes, so an unwritable path fails before anything is executed.
             check_suffix(film)
-            check_writable(film)
+            prepare_output("play", film)
         if sum((bool(plan), oracle, policy is not None, show, interactive)) != 1:
             fail(
                 "expected one of --plan FILE, --oracle, --policy FOLDER, --interactive and --show: give one of them"

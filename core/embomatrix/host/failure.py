@@ -23,6 +23,7 @@ DEFECT: Final = 70
 INTERRUPTED: Final = 130
 _STORAGE: Final = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS))
 """File system errors that are no fault of the program."""
+_FULL: Final = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG))
 
 
 @contextlib.contextmanager
@@ -44,11 +45,7 @@ def shown(command: str) -> Iterator[None]:
         if os.environ.get("EMBOMATRIX_DEBUG"):
             raise
         if isinstance(error, OSError) and error.errno in _STORAGE:
-            where = f"{error.filename} can't be written" if error.filename else "a file can't be written"
-            fail(
-                command,
-                f"{where} ({error.strerror}): free disk space, fix the permissions or name another folder",
-            )
+            fail(command, unwritable(error.filename or "a file", error))
         path = _keep(error)
         fail(
             command,
@@ -65,6 +62,31 @@ def fail(command: str, sentence: str, status: int = MENDABLE) -> NoReturn:
         printable(f"{name}: {sentence}", lines=True), highlight=False, markup=False
     )
     raise SystemExit(status)
+
+
+def unwritable(path: Path | str, error: OSError) -> str:
+    """Return the sentence about a file or folder that can't be written: its path, the reason and the remedy."""
+    reason, remedy = error.strerror or str(error), "name another path"
+    blocker = _file_above(Path(path))
+    if error.errno in _FULL:
+        remedy = "free disk space, or name another path"
+    elif error.errno in (errno.EACCES, errno.EPERM):
+        remedy = "fix the permissions, or name another path"
+    elif error.errno == errno.EROFS:
+        remedy = "name a path on another file system"
+    elif error.errno == errno.ENAMETOOLONG:
+        remedy = "name a shorter path"
+    elif blocker is not None:
+        reason, remedy = os.strerror(errno.ENOTDIR), f"{blocker} is a file; name another path"
+    return f"{path} can't be written ({reason}): {remedy}"
+
+
+def _file_above(path: Path) -> Path | None:
+    """Return the file that the path takes for a folder."""
+    try:
+        return next((folder for folder in path.parents if folder.exists() and not folder.is_dir()), None)
+    except OSError:
+        return None
 
 
 def _is_silent_interrupt(leaving: SystemExit) -> bool:

@@ -1,12 +1,14 @@
-"""Files that a command may replace: those that this tool wrote, known by a mark in their first bytes."""
+"""Files that a command writes: their folders are made, and a file that this tool did not write is not replaced."""
 
+import errno
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from embomatrix.host.failure import fail
+from embomatrix.host.failure import fail, unwritable
 
 HEAD_BYTES: Final = 4096
 """Bytes at the beginning of a file that are searched for its mark."""
@@ -16,6 +18,32 @@ PICTURE_MARK: Final = b"Software\0EmboMatrix"
 """Mark of pictures: a text chunk before the pixels of a PNG file, a comment in a JPEG file."""
 Force = Annotated[bool, typer.Option("--force", help="Replace files there that this command did not write.")]
 """Option of commands that choose the names of the files that they write."""
+
+
+def prepare_output(command: str, *paths: Path | None) -> None:
+    """Make the folders of the files that a command will write; None stands for a file that is not asked for.
+
+    Call it before long work: it exits with status 2 if a file can't be written, and leaves no file behind.
+    """
+    for path in paths:
+        if path is not None:
+            try:
+                _make_room(path)
+            except OSError as error:
+                fail(command, unwritable(path, error))
+
+
+def _make_room(path: Path) -> None:
+    """Make the folder of the file, and write and remove a file beside it. Raise OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():
+        # A device or a pipe would be replaced by a file.
+        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    part = path.with_name(f"{path.name}.part")
+    part.write_bytes(b"")
+    part.unlink()
 
 
 def is_own(path: Path, *marks: bytes) -> bool:

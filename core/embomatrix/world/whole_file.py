@@ -29,12 +29,3 @@ def read_whole(path: Path, *, at_most: int) -> bytes:
     if len(data) > at_most:
         raise OSError(errno.EFBIG, f"it has over {at_most:,} bytes", str(path))
     return data
-
-
-def check_writable(path: Path) -> None:
-    """Check before long work that ``write_whole`` can write here, without leaving a file. Raises OSError."""
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(b"")
-    part.unlink()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.world.whole_file import check_writable, read_whole, write_whole
+from embomatrix.world.whole_file import read_whole, write_whole
 
 
 def test_file_is_written_and_nothing_else_remains(tmp_path: Path) -> None:
@@ -24,16 +24,6 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     with pytest.raises(OSError):
         write_whole(target, b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
-
-
-def test_writability_check_leaves_no_file_and_reports_failures(tmp_path: Path) -> None:
-    target = tmp_path / "a.json"
-    target.write_bytes(b"old")
-    check_writable(target)
-    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"old")]
-    for impossible in (tmp_path, tmp_path / "nowhere" / "a.json", target / "a.json"):
-        with pytest.raises(OSError):
-            check_writable(impossible)
 
 
 def test_file_beyond_the_size_limit_is_refused(tmp_path: Path) -> None:

@@ -30,13 +30,14 @@ from embomatrix.bench.experiments.design import (
 )
 from embomatrix.bench.experiments.findings import figures_of, findings_of, read_runs
 from embomatrix.bench.experiments.section import add_section, learning_section
-from embomatrix.bench.report.figures import BenchResult, describe_machine
+from embomatrix.bench.report.figures import BenchError, BenchResult, describe_machine
 from embomatrix.bench.report.output import hand_in, write
 from embomatrix.cli.local_cluster import no_problem, run_command
 from embomatrix.host.code_version import commit_here
 from embomatrix.host.commands import command_group
 from embomatrix.host.failure import fail
 from embomatrix.host.limits import usable_cores
+from embomatrix.host.own_files import prepare_output
 from embomatrix.pages.figures import Figure
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.trainer.config.errors import TrainerError
@@ -142,10 +143,11 @@ def _experiment(preset: Preset, summary: str) -> Callable[..., None]:
         json_file: _Json = None,
         page: _Page = None,
     ) -> None:
-        with _refusals():
+        with _refusals(json_file, page):
             arms = checked_arms([parse_arm(text) for text in arm]) if arm else preset.arms
             if out is None or not arms:
                 raise TrainerError("an experiment needs a folder and arms: name them with --out and --arm")
+            prepare_output("experiment", out / SECTION_FILE)
             design = Design(
                 name=title,
                 dataset=f"`{dataset.name}` ({dataset_digest(dataset)})",
@@ -190,7 +192,7 @@ def table(
     page: _Page = None,
 ) -> None:
     """Success before and after GRPO on benchmarks, as in the paper's table."""
-    with _refusals():
+    with _refusals(json_file, page):
         stages = _stages(run)
         machine, commit = describe_machine(), commit_here()
         lines: list[str] = []
@@ -269,8 +271,9 @@ def _publish(section: str, own: Path, page: Path | None) -> None:
 
 
 @contextlib.contextmanager
-def _refusals() -> Iterator[None]:
+def _refusals(*outputs: Path | None) -> Iterator[None]:
+    prepare_output("experiment", *outputs)
     try:
         yield
-    except TrainerError as error:
+    except (BenchError, TrainerError) as error:
         fail("experiment", str(error))

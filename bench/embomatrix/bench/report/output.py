@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.bench.report.figures import BenchError, BenchResult, is_shared, result_to_json
-from embomatrix.host.failure import fail
+from embomatrix.host.failure import fail, unwritable
+from embomatrix.host.own_files import prepare_output
 from embomatrix.pages.figures import shown
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
@@ -42,14 +43,17 @@ def hand_in(result: BenchResult, json_file: Path | None) -> None:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a whole file or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, text.encode("utf-8"))
+    """Write a whole file or nothing. Raise BenchError."""
+    try:
+        write_whole(path, text.encode("utf-8"))
+    except OSError as error:
+        raise BenchError(unwritable(path, error)) from error
 
 
 @contextlib.contextmanager
-def refusals() -> Iterator[None]:
-    """Print one sentence and exit with status 2 for errors that the user can fix."""
+def refusals(*outputs: Path | None) -> Iterator[None]:
+    """Print one sentence and exit with status 2 for errors that the user can fix, at once for unwritable outputs."""
+    prepare_output("bench", *outputs)
     try:
         yield
     except (BenchError, BundleError, ClusterError, DatasetError, EngineError, TrainerError, OSError) as error:

@@ -23,10 +23,11 @@ from embomatrix.cli.cluster.tables import (
 from embomatrix.cli.cluster.trace import TRACE_MARK, chrome_trace
 from embomatrix.cli.connection import AsJson, manager_command
 from embomatrix.host.commands import command_group
-from embomatrix.host.failure import fail
-from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign
+from embomatrix.host.failure import fail, unwritable
+from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign, prepare_output
 from embomatrix.host.printable import printable
 from embomatrix.rpc.admin_client import AdminClient
+from embomatrix.world.whole_file import write_whole
 
 T = TypeVar("T")
 FOLLOW_S: Final = 0.5
@@ -134,6 +135,8 @@ async def report(
     force: Force = False,
 ) -> None:
     """Write the report of an open or closed run as one self-contained HTML file, ID.html by default."""
+    if not as_json:
+        prepare_output("cluster report", out)
     run_id = await client.find_run(run)
     summary = await client.run(run_id)
     if as_json:
@@ -149,6 +152,7 @@ async def report(
 @manager_command("cluster")
 async def trace(client: AdminClient, run: Run, out: Out = None, force: Force = False) -> None:
     """Write a run as a Chrome trace for https://ui.perfetto.dev, ID.trace.json by default."""
+    prepare_output("cluster trace", out)
     run_id = await client.find_run(run)
     file = out or _free(Path(f"{run_id}.trace.json"), TRACE_MARK, force=force)
     summary = await client.run(run_id)
@@ -220,9 +224,9 @@ def _free(path: Path, mark: bytes, *, force: bool) -> Path:
 
 def _write(path: Path, text: str) -> None:
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text.encode("utf-8"))
     except OSError as error:
-        fail("cluster", f"{path} can't be written ({error.strerror}): pass another --out")
+        fail("cluster", unwritable(path, error))
     print(f"{path}: {len(text) / 1e6:.1f} MB")
 
 

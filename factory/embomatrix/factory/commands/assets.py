@@ -18,7 +18,7 @@ from embomatrix.factory.importers.shelf import ASSET_MARK, asset_file, save_asse
 from embomatrix.factory.pictures.assets import draw_sheet
 from embomatrix.factory.pictures.marked_files import write_picture
 from embomatrix.host.commands import command_group
-from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign
+from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign, prepare_output
 from embomatrix.world.asset import Asset, Credit
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.records import SceneInvalidError
@@ -84,6 +84,7 @@ def draw(
     file = out or Path("assets.png")
     if out is None:
         keep_foreign("", [file], PICTURE_MARK, force=force)
+    prepare_output("factory assets draw", file)
     with user_errors(file, more=(ValueError,)):
         write_picture(file, draw_sheet(_assets(catalog, chosen, every_model=every_model)))
     say(file)
@@ -112,6 +113,7 @@ def import_(
     """Import a model file as an asset that replaces one of the catalog's models in `scene build --assets`."""
     credit = Credit(creator, licence, source or file.name)
     with user_errors(out, more=(ModelFileError, SceneInvalidError)):
+        out.mkdir(parents=True, exist_ok=True)
         raw = read_model(file, up)
         decompose = Coacd() if cut is Cut.COACD else by_components
         imported = import_model(Catalog.load(), raw, category, model, credit, decompose)

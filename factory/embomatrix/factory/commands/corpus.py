@@ -23,7 +23,7 @@ from embomatrix.factory.pipeline.corpus import (
     settings_of,
 )
 from embomatrix.factory.pipeline.store import BUILD_FILE
-from embomatrix.host.own_files import Force, keep_foreign
+from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.starter.archive import content_digest, pack, read_packed
 from embomatrix.starter.recipes import PARTS
 from embomatrix.starter.shipped import archive_of, holds_shipped, shipped_parts, unpack_part
@@ -83,7 +83,11 @@ def corpus(
     if frozen is not None:
         _check_held_out(together, chosen, "--freeze")
         keep_foreign("factory corpus", [frozen], FROZEN_MARK, force=force)
+        prepare_output("factory corpus", frozen)
     making = DAYS if proofs is None else _with_proofs(proofs)
+    with user_errors(packed):
+        if packed is not None:
+            packed.mkdir(parents=True, exist_ok=True)
     with user_errors(out):
         check_free(out)
         built = [number for number in chosen if check or packed is not None or number not in shipped]
@@ -105,11 +109,7 @@ def corpus(
         write_dataset(tasks.folder, records, {})
         for number in built:
             found = joined_part(out, number)
-            if packed is None:
-                digest = content_digest(found)
-            else:
-                packed.mkdir(parents=True, exist_ok=True)
-                digest = pack(found, packed / f"tasks-{number}.xz")
+            digest = content_digest(found) if packed is None else pack(found, packed / f"tasks-{number}.xz")
             say(f"part {number}: {len(found.records)} tasks, {digest}")
         if frozen is not None:
             say(f"Internal-Verified 2: {count} tasks, {freeze(records, count, frozen).digest}")

@@ -14,7 +14,7 @@ from embomatrix.factory.commands.terminal import fail, say, user_errors
 from embomatrix.factory.evaluate.readings import prompts_of
 from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export_rows, is_card_of
 from embomatrix.factory.scenes.build import base_scene_of
-from embomatrix.host.own_files import Force
+from embomatrix.host.own_files import Force, prepare_output
 from embomatrix.host.printable import printable
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder, DatasetOrShipped
 from embomatrix.starter.shipped import dataset_folder
@@ -92,7 +92,7 @@ def _show(record: TaskRecord) -> None:
 
 def _show_position(found: int, all_: int, page: int, limit: int, shown: int) -> None:
     if not found:
-        say(f"none of {all_:,} tasks is like that: leave out --split, --scene, --category or --search")
+        say(f"no task of {all_:,} fits: leave out --split, --scene, --category or --search")
         return
     if not shown:
         say(f"{found:,} tasks have {-(-found // limit)} pages: found --page {page}")
@@ -108,6 +108,7 @@ def prompts(
     tasks: Annotated[int, typer.Option(min=1, help="Number of held-out tasks.")] = 40,
 ) -> None:
     """Write the prompts of held-out tasks, without their goals, for a person or a model to answer."""
+    prepare_output("factory prompts", out)
     with user_errors(out):
         write_whole(out, prompts_of(Dataset.load(dataset), tasks).encode("utf-8"))
     say(f"prompts: {out}; `factory evaluate readings` judges the answers")
@@ -133,7 +134,7 @@ def export(
                 f"{foreign[0]} was not written by an export to {out.name}: name a file in another folder, or pass --force to "
                 "replace it"
             )
-        out.parent.mkdir(parents=True, exist_ok=True)
+        prepare_output("factory export", out, card)
         write_whole(out, data)
         write_whole(card, dataset_card(found, out.name, data).encode("utf-8"))
     say(f"{len(found.records)} tasks: {out}, card: {card}")

@@ -15,7 +15,7 @@ import typer
 
 from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Llm, Model, Tape, chat_model
 from embomatrix.factory.commands.options import Seed
-from embomatrix.factory.commands.terminal import check_output, counter, report_evaluation, say, user_errors
+from embomatrix.factory.commands.terminal import counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics_fit import evaluate_aesthetics
 from embomatrix.factory.evaluate.judges import evaluate_looks, judged
@@ -43,7 +43,7 @@ from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.host.code_version import commit_here
-from embomatrix.host.own_files import Force, keep_foreign
+from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.llm.values import ChatModel
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.starter.shipped import unpack
@@ -143,7 +143,7 @@ def evaluate(
         "skills": lambda: _skills(dataset or _shipped(scratch), only, jobs),
         "aesthetics": lambda: _aesthetics(_given(rooms, "--rooms FILE"), seed, calibration),
     }
-    check_output(page)
+    prepare_output("factory evaluate", page, calibration, outcomes)
     with user_errors(more=MODEL_ERRORS), kept:
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")

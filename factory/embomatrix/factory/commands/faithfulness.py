@@ -15,9 +15,9 @@ from embomatrix.factory.evaluate.faithfulness import (
     read_answers,
 )
 from embomatrix.factory.evaluate.verification import sampled
+from embomatrix.host.own_files import prepare_output
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.world.dataset import Dataset
-from embomatrix.world.whole_file import check_writable
 
 
 def audit(
@@ -40,9 +40,8 @@ def audit(
 
     Exit status 1 if a task has such a plan, or if its instruction and goal disagree.
     """
-    with user_errors(json_file):
-        if json_file is not None:
-            check_writable(json_file)
+    prepare_output("factory audit", json_file)
+    with user_errors():
         records = sampled(Dataset.load(dataset).records, sample, seed)
         if not records:
             fail(f"{dataset} contains no task: name a dataset with tasks")

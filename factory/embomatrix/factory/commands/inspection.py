@@ -9,12 +9,12 @@ from embomatrix.factory.commands.terminal import progress, say, user_errors
 from embomatrix.factory.inspection.page import scene_jpeg, scene_picture, task_page
 from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
-from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign
+from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign, prepare_output
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder, DatasetOrShipped
 from embomatrix.starter.shipped import dataset_folder
 from embomatrix.world.dataset import Dataset, bundle_file
 from embomatrix.world.json_text import parse_json
-from embomatrix.world.whole_file import check_writable, write_whole
+from embomatrix.world.whole_file import write_whole
 
 PICTURES_FOLDER = "pictures"
 CARD_PX = (720, 540)
@@ -36,7 +36,7 @@ def inspect(
         record = loaded.find(task)
         if out is None:
             keep_foreign("", [file], PAGE_MARK, force=force)
-        check_writable(file)
+        prepare_output("factory inspect", file)
         bundle = loaded.bundle(record.bundle_digest)
         transcript = _text(loaded.folder / TRANSCRIPTS_FOLDER / f"{task}.md")
         tree = _text(loaded.folder / TREES_FOLDER / f"{task}.json")

@@ -13,7 +13,7 @@ import typer
 from PIL import Image
 from rich.console import Console
 
-from embomatrix.factory.commands.terminal import check_output, fail, progress, say, show_table, user_errors
+from embomatrix.factory.commands.terminal import fail, progress, say, show_table, user_errors
 from embomatrix.factory.floorplan.house_file import SUFFIX as HOUSE_SUFFIX
 from embomatrix.factory.floorplan.house_file import HouseFileError, read_house
 from embomatrix.factory.floorplan.procthor import MARK as HOUSE_MARK
@@ -38,7 +38,7 @@ from embomatrix.factory.scenes.report import TABLE_COLUMNS, SceneReport, problem
 from embomatrix.factory.scenes.scene_file import SCENE_MARKS, SUFFIX, SceneFileError, read_scene
 from embomatrix.host.commands import command_group
 from embomatrix.host.limits import usable_cores
-from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign
+from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign, prepare_output
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 from embomatrix.world.whole_file import write_whole
@@ -146,7 +146,7 @@ def build(
         houses = _houses(chosen)
         if assets is not None:
             read_assets(assets)
-    check_output(report)
+    prepare_output("scene build", report)
     with _user_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     several = len(set(seeds or ())) > 1
@@ -185,6 +185,7 @@ def import_house(
     keep_foreign("scene import", [path], HOUSE_MARK, force=force)
     with _user_errors():
         text, notes = house_file_of(house, scene)
+    prepare_output("scene import", path)
     with _user_errors(path):
         write_whole(path, text.encode("utf-8"))
     say(path)
@@ -217,7 +218,7 @@ def check(
                 orders += [
                     SceneBuildJob(scene_id, seed, house=house) for seed in dict.fromkeys(seeds or (0,))
                 ]
-    check_output(report)
+    prepare_output("scene check", report)
     _print_reports(_run(orders, jobs), report)
 
 

@@ -10,7 +10,7 @@ import typer
 
 from embomatrix.factory.admission import TaskRefusal
 from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
-from embomatrix.factory.commands.terminal import check_output, counter, fail, say, show_table, user_errors
+from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
 from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import DEFAULT_SCENES
 from embomatrix.factory.pipeline.store import ResumableLog
@@ -39,7 +39,7 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.host.own_files import Force, keep_foreign
+from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.world.bddl import BddlError, BddlProblem
 from embomatrix.world.dataset import TASKS_FILE, DatasetError, write_dataset
 from embomatrix.world.scene import Scene
@@ -99,8 +99,7 @@ def import_(
     kept = (
         "; finished outcomes are kept; run the same command again to resume" if outcomes is not None else ""
     )
-    for file in (report, json_file):
-        check_output(file)
+    prepare_output("factory import", report, json_file, outcomes)
     if report is not None:
         keep_foreign("", {report.with_suffix(".md")} - {report}, REPORT_MARK, force=force)
     with user_errors(out or outcomes, kept):

@@ -33,7 +33,6 @@ from embomatrix.sim.engine import EngineError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
-from embomatrix.world.whole_file import check_writable
 
 fail = functools.partial(failure.fail, "")
 """Print a sentence on standard error and exit the command."""
@@ -104,18 +103,9 @@ def user_errors(
             raise
         if out is None and error.errno not in _NO_SPACE:
             fail(f"{error.filename} can't be used ({error.strerror}): name another file or folder")
-        fail(
-            f"{out or error.filename} can't be written ({error.strerror}): free disk space, or name another path{kept}"
-        )
+        fail(f"{failure.unwritable(out or error.filename, error)}{kept}")
     except KeyboardInterrupt:
         fail(f"interrupted{kept}", status=130)
-
-
-def check_output(path: Path | None) -> None:
-    """Reject an output file that can't be written before minutes of work begin."""
-    if path is not None:
-        with user_errors(path):
-            check_writable(path)
 
 
 def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> None:

@@ -20,6 +20,7 @@ from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.factory.task_import.task import ImportedTask, slug_of
 from embomatrix.factory.task_import.task_file import SOURCE, TaskFile, read_task_file
 from embomatrix.factory.task_import.trial import STAGES, TaskTrial, TrialStage, try_task
+from embomatrix.host.own_files import prepare_output
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import ReachabilitySurvey
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
@@ -35,7 +36,7 @@ from embomatrix.world.dataset import (
 )
 from embomatrix.world.evaluate import GoalError, scored_atoms
 from embomatrix.world.scene import Scene
-from embomatrix.world.whole_file import check_writable, write_whole
+from embomatrix.world.whole_file import write_whole
 
 DEFAULT_SCENE: Final = "Rs_int"
 DEFAULT_FOLDER: Final = Path("build/try")
@@ -85,9 +86,7 @@ def try_(
         base = chosen.only(named)
     with user_errors(folder):
         _check_free(folder, task_file)
-    with user_errors(page):
-        if page is not None:
-            check_writable(page)
+    prepare_output("factory try", page)
     with (
         user_errors(folder, more=(FactError, GoalError)),
         contextlib.closing(PlacementLibrary()) as library,

@@ -8,9 +8,9 @@ import typer
 from embomatrix.factory.commands.options import Jobs, processes
 from embomatrix.factory.commands.terminal import counter, fail, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.verification import evaluation_of, objections, sampled, verify_again
+from embomatrix.host.own_files import prepare_output
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.world.dataset import Dataset
-from embomatrix.world.whole_file import check_writable
 
 Physical = Annotated[
     bool,
@@ -32,9 +32,8 @@ def verify(
 
     Exit status 1 if a task is not admitted again or two processes disagree.
     """
-    with user_errors(json_file):
-        if json_file is not None:
-            check_writable(json_file)
+    prepare_output("factory verify", json_file)
+    with user_errors():
         records = sampled(Dataset.load(dataset).records, sample, seed)
         if not records:
             fail(f"{dataset} contains no task: name a dataset with tasks")

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from embomatrix.host.failure import unwritable
 from embomatrix.manager.access.certificates import (
     RENEWAL,
     KeyPair,
@@ -118,7 +119,7 @@ def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
             f"{error.filename} no longer exists: issue a token with `embomatrix manager token issue --role {role}`"
         ) from error
     except OSError as error:
-        raise AccessError(f"{error.filename or target} can't be written ({error.strerror})") from error
+        raise AccessError(unwritable(error.filename or target, error)) from error
 
 
 def _authority(folder: AccessFolder, now: datetime, done: PreparedAccess) -> KeyPair:

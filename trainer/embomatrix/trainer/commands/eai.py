@@ -8,11 +8,13 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from embomatrix.host.failure import fail
+from embomatrix.host.failure import fail, unwritable
+from embomatrix.host.own_files import prepare_output
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.eai.environment import JudgeEnvironment, default_folder, install
 from embomatrix.trainer.eai.judge import NativeJudge
 from embomatrix.world.json_text import parse_json
+from embomatrix.world.whole_file import write_whole
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 console = Console(highlight=False, markup=False, soft_wrap=True)
@@ -49,14 +51,15 @@ def judge_command(
     out: Annotated[Path, typer.Argument(help="JSON file for the results.")],
 ) -> None:
     """Judge a file of answers in EAI's own format. For tables of results, use `embomatrix eval`."""
+    prepare_output("eai judge", out)
     try:
         given = _read(answers)
         with NativeJudge(JudgeEnvironment.find()) as judge:
             known = {task.demo for task in judge.tasks()}
             results = [_result(judge, known, entry) for entry in given]
-        out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        write_whole(out, (json.dumps(results, indent=1) + "\n").encode("utf-8"))
     except OSError as error:
-        fail("eai judge", f"{out} can't be written ({error.strerror}): pass another file")
+        fail("eai judge", unwritable(out, error))
     except TrainerError as error:
         fail("eai judge", str(error))
     counts = {

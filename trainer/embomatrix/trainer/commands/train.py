@@ -13,7 +13,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.host.failure import INTERRUPTED, fail
+from embomatrix.host.failure import INTERRUPTED, fail, unwritable
+from embomatrix.host.own_files import prepare_output
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
@@ -116,6 +117,7 @@ def train(
             "track": track,
             **_coefficients(reward or ()),
         }
+        prepare_output("train", record)
         start = _start(dataset, out, model, settings_file, changes, resume=resume)
         _show_summary(_run(start, connect, out, record))
 
@@ -230,7 +232,7 @@ def _traffic_log(path: Path | None) -> Iterator[Callable[[Batch], None]]:
     try:
         log = TrafficLog(path)
     except OSError as error:
-        raise TrainerError(f"--record {path}: it can't be written ({error.strerror})") from error
+        raise TrainerError(unwritable(path, error)) from error
     with contextlib.closing(log):
         yield log.append
 

@@ -14,6 +14,7 @@ from typing import IO, Annotated, Any, Final, Self
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from embomatrix.host.failure import unwritable
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.json_text import parse_json
@@ -93,9 +94,7 @@ class AnswerSheet:
             if not exists:
                 self._write({"answers": VERSION, **asdict(self.setup)})
         except OSError as error:
-            raise TrainerError(
-                f"the answers {self.path} can't be written ({error.strerror}): pass another --out"
-            ) from error
+            raise TrainerError(f"the answers {unwritable(self.path, error)}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
