@@ -2,7 +2,7 @@
 
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
-from tests.fakes.peers import EXAMPLES, PHYSICS, Peer
+from tests.fakes.peers import EXAMPLES, PHYSICS, ROOT, Peer
 
 pytestmark = [pytest.mark.peers, pytest.mark.timeout(900)]
 CHECK = """
@@ -34,7 +34,16 @@ for call in ("move 10", "pick_up 10", "move 0", "place 0 ontop"):
     total += gain
 assert over and step["success"], observation["message"]
 assert "2 calls: expected one" in env.step("move 10\\nmove 0")[0]["message"]
-wrongs = (({"skill": 0}, "the action lacks distance"), (3, "the action is int"), ({**sampled, "skill": 99}, "skill 99"))
+wrongs = (
+    ({"skill": 0}, "the action lacks distance"), (3, "the action is int"), (b"move 3", "the action is bytes"),
+    ({**sampled, "skill": 99}, "skill is 99: expected a whole number from 0 to"),
+    ({**sampled, "skill": "move"}, "skill is 'move': expected a whole number"),
+    ({**sampled, "object": -1}, "object is -1: expected a whole number"),
+    ({**sampled, "room": -1}, "room is -1: expected a whole number"),
+    ({**sampled, "source": 1.5}, "source is 1.5: expected a whole number"),
+    ({**sampled, "yaw": float("nan")}, "yaw is nan: expected a finite number"),
+    ({**sampled, "distance": None}, "distance is None: expected a finite number"),
+)
 for wrong, words in wrongs:
     try:
         env.step(wrong)
@@ -53,6 +62,16 @@ except ValueError as error:
 """
 
 
+PRINTED = """
+import pathlib, re, sys
+blocks = re.findall(r"```python\\n(.*?)```", pathlib.Path(sys.argv[2]).read_text(), re.DOTALL)
+(block,) = [text for text in blocks if "gymnasium" in text]
+known = {}
+exec(compile(block.replace("build/dataset", sys.argv[1]), "adapters.md", "exec"), known)
+print(known["observation"]["message"])
+"""
+
+
 @pytest.fixture(scope="module")
 def peer():
     return Peer("gymnasium", "gymnasium==1.4.0", *PHYSICS)
@@ -65,6 +84,10 @@ def dataset(tmp_path_factory):
 
 def test_environment_passes_gymnasiums_checker(peer, dataset):
     assert "there is no task 'elsewhere'" in peer.run("-c", CHECK, dataset)
+
+
+def test_example_of_the_page_runs(peer, dataset):
+    assert peer.run("-c", PRINTED, dataset, ROOT / "docs" / "adapters.md").strip()
 
 
 def test_oracle_plans_reach_their_goals_and_a_random_agent_does_not(peer, dataset):

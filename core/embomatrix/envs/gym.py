@@ -148,11 +148,8 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             raise ValueError(
                 f"the action {lacks}: expected a dict with {', '.join(self._calls.spaces)}, or a text with one call"
             )
-        if not 0 <= int(action["skill"]) < len(SKILLS) or not 0 <= int(action["relation"]) < len(RELATIONS):
-            raise ValueError(
-                f"skill {action['skill']} or relation {action['relation']} is out of range: expected less than "
-                f"{len(SKILLS)} and {len(RELATIONS)}"
-            )
+        for name, space in self._calls.spaces.items():
+            _check_number(name, action[name], int(space.n) if isinstance(space, spaces.Discrete) else None)
         return call_of(action, episode.situation.rooms)
 
     def render(self) -> str | None:
@@ -227,6 +224,20 @@ def step_info(outcome: EpisodeStep) -> dict[str, Any]:
         "failure": outcome.step.failure.value if outcome.step.failure is not None else "",
         **reward.tiers,
     }
+
+
+def _check_number(name: str, value: object, count: int | None) -> None:
+    """Raise ValueError for a value that isn't a whole number below ``count``, or a finite number if that is None."""
+    try:
+        number = float(value)  # type: ignore[arg-type]  # any object: float() itself is the check
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if count is None:
+        valid, expected = math.isfinite(number), "a finite number"
+    else:
+        valid, expected = number.is_integer() and 0 <= number < count, f"a whole number from 0 to {count - 1}"
+    if not valid:
+        raise ValueError(f"the action's {name} is {value!r}: expected {expected}")
 
 
 def _plain(text: str) -> str:

@@ -9,9 +9,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from openenv.core.env_server.http_server import create_app
-from openenv.core.env_server.interfaces import Environment
-from openenv.core.env_server.types import Action, Observation, State
+
+try:
+    from openenv.core.env_server.http_server import create_app
+    from openenv.core.env_server.interfaces import Environment
+    from openenv.core.env_server.types import Action, Observation, State
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"embomatrix.envs.openenv needs the package {error.name}: pip install 'openenv>=0.10'",
+        name=error.name,
+    ) from None
 
 from embomatrix.envs.episode import Episode, Household
 from embomatrix.reward.settings import PAPER

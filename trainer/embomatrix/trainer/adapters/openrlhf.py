@@ -5,7 +5,6 @@
 """
 
 import asyncio
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,7 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.starter.options import DATASET_VARIABLE
-from embomatrix.trainer.adapters.rows import messages, tasks_of
+from embomatrix.trainer.adapters.rows import dataset_named, messages, tasks_of
 from embomatrix.trainer.adapters.scorer import PlanScorer, shared_scorer
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import evaluation_seed, load_tasks, training_seed
@@ -57,10 +55,8 @@ def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence
         task_ids = [RewardLabel.parse(label).task_id for label in labels]
     except InvalidRequestError as error:
         raise TrainerError(str(error)) from error
-    dataset = os.environ.get(DATASET_VARIABLE, "")
-    if not dataset:
-        raise TrainerError(f"{DATASET_VARIABLE} is not set: set it to the dataset's folder")
-    return reward_payload(asyncio.run(rewards_of(shared_scorer(dataset), task_ids, answers)))
+    scorer = shared_scorer(dataset_named("", ""))
+    return reward_payload(asyncio.run(rewards_of(scorer, task_ids, answers)))
 
 
 async def rewards_of(

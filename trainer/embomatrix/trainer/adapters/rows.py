@@ -1,9 +1,11 @@
 """Dataset rows for other trainers: the prompt, and the key by which the reward finds the task."""
 
+import os
 from pathlib import Path
 from typing import Any
 
 from embomatrix.skills.prompt import Codec, Situation, prompt_for
+from embomatrix.starter.options import DATASET_VARIABLE
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import TrainingTask, load_tasks
 
@@ -36,6 +38,16 @@ def verl_rows(dataset: str | Path, split: str = "train", codec: Codec = Codec.JS
         }
         for index, task in enumerate(tasks_of(dataset, split))
     ]
+
+
+def dataset_named(given: str, option: str) -> str:
+    """Return the dataset's folder: the given one, or else the variable's. Raises TrainerError, which names ``option``."""
+    found = given or os.environ.get(DATASET_VARIABLE, "")
+    if not found:
+        raise TrainerError(
+            f"{DATASET_VARIABLE} is not set: set it to the dataset's folder{option and f', or pass {option}'}"
+        )
+    return found
 
 
 def tasks_of(dataset: str | Path, split: str) -> tuple[TrainingTask, ...]:

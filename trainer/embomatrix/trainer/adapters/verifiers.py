@@ -6,18 +6,23 @@ environment configures the cluster.
 
 from collections.abc import Iterator
 
-import verifiers.v1 as vf
+try:
+    import verifiers.v1 as vf
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"embomatrix.trainer.adapters.verifiers needs the package {error.name}: pip install 'verifiers>=0.4'",
+        name=error.name,
+    ) from None
 
 from embomatrix.skills.prompt import Codec, prompt_for
-from embomatrix.trainer.adapters.rows import tasks_of
+from embomatrix.trainer.adapters.rows import dataset_named, tasks_of
 from embomatrix.trainer.adapters.scorer import shared_scorer
 
 __all__ = ["HouseholdTaskset"]
-NO_DATASET = "no dataset: pass its folder with --env.taskset.dataset"
 
 
 class HouseholdConfig(vf.TasksetConfig):  # type: ignore[misc]  # untyped where it is not installed
-    """``dataset``: folder of a dataset; ``split``: train or heldout."""
+    """``dataset``: folder of a dataset, by default that of ``EMBOMATRIX_DATASET``; ``split``: train or heldout."""
 
     dataset: str = ""
     split: str = "train"
@@ -45,16 +50,15 @@ class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):  # type: ign
     """Tasks of one split."""
 
     def load(self) -> Iterator[HouseholdTask]:
-        """Raises TrainerError if the dataset can't be read, ValueError if none is given."""
-        if not self.config.dataset:
-            raise ValueError(NO_DATASET)
-        for task in tasks_of(self.config.dataset, self.config.split):
+        """Raises TrainerError if no dataset is named, or if it can't be read."""
+        dataset = dataset_named(self.config.dataset, "--env.taskset.dataset")
+        for task in tasks_of(dataset, self.config.split):
             prompt = prompt_for(task.situation, Codec.JSON)
             data = HouseholdData(
                 id=task.task.task_id,
                 prompt=prompt.user,
                 system_prompt=prompt.system,
-                dataset=self.config.dataset,
+                dataset=dataset,
                 category=task.task.category.value,
             )
             yield HouseholdTask(data, self.config.task)

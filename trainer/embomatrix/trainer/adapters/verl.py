@@ -7,6 +7,7 @@ sample as soon as it is generated, so simulation and generation overlap.
 from collections.abc import Mapping
 
 from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.trainer.adapters.rows import dataset_named
 from embomatrix.trainer.adapters.scorer import shared_scorer
 
 
@@ -16,7 +17,7 @@ async def compute_score(
     ground_truth: str,
     extra_info: Mapping[str, object] | None = None,
     *,
-    dataset: str,
+    dataset: str = "",
     manager: str = "",
     token: str = "",
     ca: str = "",
@@ -27,7 +28,8 @@ async def compute_score(
     ``ground_truth`` is the task's id; the keyword arguments are ``custom_reward_function.reward_kwargs``. verl has no mark for
     a missing reward, and NaN would spoil its step, so lost rollouts are repeated.
     """
-    scorer = shared_scorer(dataset, manager, token, ca)
+    named = dataset_named(dataset, "custom_reward_function.reward_kwargs.dataset")
+    scorer = shared_scorer(named, manager, token, ca)
     return reward_payload(await scorer.reward_of(ground_truth, solution_str))
 
 
