@@ -54,7 +54,7 @@ class FloorGrid:
         self._own = object()
         covered, free = stored or (self._rasterised(scene, boxes), None)
         self._covered = covered
-        self._free: BoolArray | None = _clear(covered) if free is None else free
+        self._free: BoolArray | None = clear_floor(covered) if free is None else free
 
     def _rasterised(self, scene: Scene, boxes: FloatArray) -> NDArray[np.int16]:
         covered = (~_floor_of(scene, self._shape, self._window)).astype(np.int16)
@@ -93,7 +93,7 @@ class FloorGrid:
             here = self._window((a - reach, b - reach), (c + reach, d + reach))
             around = self._window((a - 2 * reach, b - 2 * reach), (c + 2 * reach, d + 2 * reach))
             _, inner = overlap(here, around)
-            free[overlap(window, here)[0]] = _clear(self._covered_in(around, changes))[inner]
+            free[overlap(window, here)[0]] = clear_floor(self._covered_in(around, changes))[inner]
         grid = self._with_parts(self.parts.changed(free, window))
         grid._changes = changes
         return grid
@@ -312,7 +312,7 @@ def _cells_between(low_m: float, high_m: float, origin_m: float, count: int) -> 
     return first, last
 
 
-def _clear(covered: NDArray[np.int16]) -> BoolArray:
+def clear_floor(covered: NDArray[np.int16]) -> BoolArray:
     """Cells at least a robot's radius from every covered one, in the same shape.
 
     Spreads covered cells over a disc, row by row: a distance transform takes twenty times as long.
