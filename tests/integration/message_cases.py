@@ -876,6 +876,20 @@ COMMANDS = (
         hidden_package="pyarrow",
     ),
     CommandCase(
+        "Pillow is not installed for a film",
+        "play 'open the fridge' --dataset=KITCHEN --oracle --film=FILES/new.gif",
+        "'PIL'",
+        "pip install 'embomatrix[factory]'",
+        hidden_package="PIL",
+    ),
+    CommandCase(
+        "build tools of the wheel are not installed",
+        "bench first-hour --seeds=0",
+        "without build",
+        "pip install -e '.[bench]'",
+        hidden_package="build",
+    ),
+    CommandCase(
         "bddl is not installed",
         "factory import --activity=bringing_water --scene=Rs_int",
         "bddl",

@@ -8,8 +8,8 @@ import contextlib
 import itertools
 import os
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from typing import Final
 
@@ -24,16 +24,20 @@ GROUP: Final = "embomatrix.commands"
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Help text of a subcommand, and the extra that installs its packages."""
+    """Help text of a subcommand, and the extra that installs its packages.
+
+    ``optional``: packages that some options need beyond these, with the extra that installs each.
+    """
 
     panel: str
     summary: str
     extra: str
+    optional: Mapping[str, str] = field(default_factory=dict)
 
 
 COMMANDS: Final[dict[str, Command]] = {
     "demo": Command("Start here", "start a local cluster and train on it, as `make run` does", "all"),
-    "doctor": Command("Start here", "check this machine and the connection to a manager", "manager"),
+    "doctor": Command("Start here", "check this machine and the connection to a manager", "worker"),
     "manager": Command("Cluster", "serve a Simulation Manager, and manage its tokens", "manager"),
     "worker": Command("Cluster", "run a worker on this machine", "worker"),
     "status": Command("Cluster", "describe a cluster in a few sentences", "manager"),
@@ -42,7 +46,10 @@ COMMANDS: Final[dict[str, Command]] = {
     "factory": Command("Tasks and scenes", "build a dataset of verified tasks, import BDDL", "factory"),
     "scene": Command("Tasks and scenes", "build, check and draw base scenes", "factory"),
     "play": Command(
-        "Tasks and scenes", "execute a plan in a task; explain each step and the reward", "factory"
+        "Tasks and scenes",
+        "execute a plan in a task; explain each step and the reward",
+        "physics",
+        {"torch": "trainer", "PIL": "factory"},
     ),
     "imitate": Command(
         "Training and evaluation", "warm up a policy on oracle plans, without a cluster", "trainer"
@@ -50,11 +57,16 @@ COMMANDS: Final[dict[str, Command]] = {
     "train": Command(
         "Training and evaluation", "train a policy with imitation and GRPO on a cluster", "trainer"
     ),
-    "eval": Command("Training and evaluation", "measure a model, an endpoint or a baseline", "trainer"),
+    "eval": Command(
+        "Training and evaluation",
+        "measure a model, an endpoint or a baseline",
+        "trainer",
+        {"scipy": "physics"},
+    ),
     "eai": Command("Training and evaluation", "install and run the judge of the EAI benchmark", "trainer"),
     "model": Command("Training and evaluation", "import a packaged language model", "hf"),
     "experiment": Command("Measurements", "repeat the paper's experiments: curves, tables, times", "all"),
-    "bench": Command("Measurements", "measure rollouts and the cluster on this machine", "worker"),
+    "bench": Command("Measurements", "measure rollouts and the cluster on this machine", "bench"),
 }
 
 
@@ -97,10 +109,12 @@ def _missing_package_shown(name: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if (error.name or "embomatrix").startswith("embomatrix"):
             raise
-        extra = COMMANDS[name].extra if name in COMMANDS else "all"
+        package = str(error.name).split(".")[0]
+        command = COMMANDS.get(name)
+        extra = command.optional.get(package, command.extra) if command is not None else "all"
         fail(
             name,
-            f"the package {error.name!r} is not installed: install it with `pip install 'embomatrix[{extra}]'`",
+            f"the package {package!r} is not installed: install it with `pip install 'embomatrix[{extra}]'`",
         )
 
 

@@ -17,7 +17,6 @@ from rich.table import Table
 from embomatrix.cli.play_by_hand import play_by_hand
 from embomatrix.envs.episode import Episode
 from embomatrix.factory.commands.terminal import counter, fail, user_errors
-from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
 from embomatrix.host.own_files import prepare_output
 from embomatrix.host.printable import printable
 from embomatrix.reward.breakdown import RewardBreakdown
@@ -101,11 +100,9 @@ def play(
 
     Exit status: 0 if the plan was executed, 1 if the text is not a plan, 2 for other bad input.
     """
-    with user_errors(film, more=(FactError, FilmError, GoalError)):
+    with user_errors(film, more=(FactError, GoalError)):
         if film is not None:
-            # Drawing takes minutes, so an unwritable path fails before anything is executed.
-            check_suffix(film)
-            prepare_output("play", film)
+            _check_film(film)
         if sum((bool(plan), oracle, policy is not None, show, interactive)) != 1:
             fail(
                 "expected one of --plan FILE, --oracle, --policy FOLDER, --interactive and --show: give one of them"
@@ -238,8 +235,22 @@ def _run(bundle: Bundle, task: Task, plan: Plan, mode: PlayMode, seed: int, film
         _draw(film_physical(simulator, actor, task, plan, seed), film)
 
 
+def _check_film(path: Path) -> None:
+    """Refuse a file that can't be written before anything is executed: drawing takes minutes."""
+    from embomatrix.factory.pictures.film import FilmError, check_suffix
+
+    try:
+        check_suffix(path)
+    except FilmError as error:
+        fail(str(error))
+    prepare_output("play", path)
+
+
 def _draw(film: Film, path: Path) -> None:
     """Draw the film with a progress bar and write it."""
+    # Only films need Pillow, so playing works without it.
+    from embomatrix.factory.pictures.film import Caption, draw_film, write_film
+
     done = [step.ok for step in film.steps]
     captions = [
         Caption(call_in_words(call, film.task.table), done[number] if number < len(done) else None)

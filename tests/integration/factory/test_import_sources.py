@@ -6,9 +6,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from click.testing import Result
 from tests.fakes.problems import PROBLEM
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from embomatrix.factory.admission import RefusedError, TaskRefusal
 from embomatrix.factory.commands.app import app

@@ -3,9 +3,10 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
-from pydantic_core import to_jsonable_python
+from pydantic import TypeAdapter
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
@@ -45,7 +46,8 @@ def show(table: Table) -> None:
 
 def show_json(value: object) -> None:
     """Print a value as JSON; dataclasses become objects."""
-    print(printable(json.dumps(value, default=to_jsonable_python, ensure_ascii=False)))
+    plain = partial(TypeAdapter(Any).dump_python, mode="json")
+    print(printable(json.dumps(value, default=plain, ensure_ascii=False)))
 
 
 def event_plain(event: RunEvent) -> dict[str, Any]:

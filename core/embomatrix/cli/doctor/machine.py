@@ -15,9 +15,18 @@ from typing import Final
 
 NEEDED: Final[Mapping[str, tuple[str, ...]]] = {
     "worker": ("pybullet", "scipy", "psutil"),
-    "manager": ("fastapi", "uvicorn", "redis", "prometheus_client", "cryptography", "grpc_health"),
-    "factory": ("pybullet", "scipy", "trimesh", "PIL", "httpx"),
-    "trainer": ("torch", "httpx"),
+    "manager": (
+        "fastapi",
+        "starlette",
+        "uvicorn",
+        "redis",
+        "prometheus_client",
+        "cryptography",
+        "grpc_health",
+        "grpc_reflection",
+    ),
+    "factory": ("pybullet", "scipy", "trimesh", "PIL", "inflect", "httpx"),
+    "trainer": ("torch", "matplotlib", "httpx"),
 }
 """Packages of each part, by the extra that installs them."""
 PORTS: Final[Mapping[str, int]] = {"port of workers and trainers": 50070, "port of the status page": 8070}
