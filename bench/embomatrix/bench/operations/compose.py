@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 PROJECT: Final = "embomatrix-bench"
 """Project name, which keeps networks, volumes and ports apart from those of a running cluster."""
-GOALS_MB: Final = {"worker": 400.0, "manager": 250.0, "trainer": 1200.0}
+GOALS_MB: Final = {"worker": 400.0, "manager": 200.0, "trainer": 1200.0}
 """Largest size of each image. The trainer's holds for CPU builds of torch (``TORCH_INDEX``)."""
 CLUSTER_IMAGES: Final = ("worker", "manager")
 """Images that `docker compose up` needs. The trainer's is built with `docker compose --profile trainer build`."""
