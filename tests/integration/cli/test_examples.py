@@ -54,6 +54,7 @@ CHECKED = Counter(
         ("spare_pcs.md", "toml"): 1,
         ("spare_pcs.md", "xml"): 1,  # test_property_list_of_the_page_runs_a_worker
         ("operations.md", "json"): 1,  # test_log_line_of_the_page_has_the_fields_of_a_log_line
+        ("README.md", "plan"): 1,  # test_plan_of_the_readme_earns_the_printed_reward
         ("README.md", "mermaid"): 1,  # `make diagrams`
         ("architecture.md", "mermaid"): 2,
         ("protocol.md", "mermaid"): 1,
@@ -206,6 +207,21 @@ def test_refusal_of_a_house_is_the_printed_one(tmp_path: Path, monkeypatch: pyte
     refused = CliRunner().invoke(scene_commands.app, ["build", "my_flat.toml", "--out", "scenes"])
     assert refused.exit_code == 2
     assert refused.stderr.strip() == f"embomatrix: {printed}"
+
+
+def test_plan_of_the_readme_earns_the_printed_reward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (plan,) = re.findall(r"```plan\n(.*?)```", readme, re.DOTALL)
+    (task,) = re.findall(r"embomatrix play (\S+) --oracle", readme)
+    monkeypatch.chdir(tmp_path)  # without a dataset: of the shipped tasks
+    monkeypatch.delenv("EMBOMATRIX_DATASET", raising=False)
+    Path("plan.txt").write_text(plan)
+    status, output = typed(f"play {task} --plan plan.txt")
+    assert status == 0, output
+    (reward,) = re.findall(r"the reward is (\d+\.\d):", readme)
+    assert re.search(rf"total\s*│ success\s*│\s*{reward}0 ", output), output
+    (request,) = re.findall(r"^> (.*)$", readme, re.MULTILINE)
+    assert request in " ".join(output.split())
 
 
 def test_settings_of_the_pages_are_valid() -> None:
