@@ -6,8 +6,9 @@ import re
 import pytest
 
 from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.likeness import like_eai
 from embomatrix.factory.task_import.reach import unreachable_atoms
-from embomatrix.factory.task_import.sources import read_eai
+from embomatrix.factory.task_import.sources import LIKE_EAI, read_eai
 from embomatrix.trainer.eai.environment import install
 from embomatrix.world.task import Profile
 
@@ -16,8 +17,13 @@ pytestmark = [pytest.mark.eai, pytest.mark.timeout(900)]
 
 
 @pytest.fixture(scope="module")
-def problems():
-    return {source.name: read_problem(source)[0] for source in read_eai(install().package_root)}
+def sources():
+    return read_eai(install().package_root)
+
+
+@pytest.fixture(scope="module")
+def problems(sources):
+    return {source.name: read_problem(source)[0] for source in sources}
 
 
 def blocking(problems, profile):
@@ -45,3 +51,7 @@ def test_fifty_nine_goals_are_within_the_paper_s_skills_and_ninety_nine_within_t
     assert unreachable_atoms(problems["chopping_vegetables"], Profile.HOUSEHOLD) == (
         "(sliced ?chestnut.n.03)",
     )
+
+
+def test_activities_with_goals_like_those_of_eai_are_the_ones_that_imports_hold_out(sources):
+    assert like_eai(sources) == LIKE_EAI

@@ -40,6 +40,16 @@ _NAMESAKES: Final = (
 EAI_NAMESAKES: Final = frozenset(_NAMESAKES.split())
 """BEHAVIOR-1K activities that share a name with a task of EAI. Training on them would contaminate that evaluation."""
 
+ALIKE: Final = 1 / 3
+"""Likeness of goals from which an activity counts as a near-duplicate of an EAI task (`likeness.likeness`)."""
+_LIKE_EAI: Final = (
+    "clean_a_broiler_pan clean_a_felt_pool_table_top clean_outdoor_tiles clean_vans cleaning_camper_or_RV cleaning_vehicles "
+    "mopping_the_kitchen_floor preserving_fruit sweeping_floors sweeping_garage vacuuming_vehicles watering_outdoor_flowers "
+    "waxing_floors"
+)
+LIKE_EAI: Final = frozenset(_LIKE_EAI.split())
+"""BEHAVIOR-1K activities with other names whose goals are like that of a task of EAI: near-duplicates of that evaluation."""
+
 
 class ProblemSourceError(ValueError):
     """Source that can't be read. The message is a sentence with the remedy."""
@@ -68,8 +78,8 @@ class SourceText:
 
     @property
     def is_held_out(self) -> bool:
-        """True for EAI's tasks and their namesakes. They are used for evaluation only, never for training."""
-        return self.source == EAI or self.name.replace("-", "_") in EAI_NAMESAKES
+        """True for EAI's tasks, their namesakes and near-duplicates: for evaluation only, never for training."""
+        return self.source == EAI or self.name.replace("-", "_") in EAI_NAMESAKES | LIKE_EAI
 
 
 def activity_names() -> tuple[str, ...]:
