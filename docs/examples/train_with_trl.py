@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("out")
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--group", type=int, default=8)
-    parser.add_argument("--tokens", type=int, default=512)
+    parser.add_argument("--tokens", type=int, default=1024)
     parser.add_argument("--cpu", action="store_true")
     chosen = parser.parse_args()
 

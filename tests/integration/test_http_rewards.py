@@ -1,9 +1,12 @@
 """Rewards over HTTP: OpenRLHF's format, access, and refusals."""
 
+import ast
 import asyncio
 
 import httpx
 import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.documents import snippets
 from tests.fakes.guarded import guarded
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, manager, open_run
@@ -128,3 +131,25 @@ async def test_rewards_need_a_trainer_token(tmp_path):
 
 def test_label_round_trips():
     assert RewardLabel.parse(LABEL) == RewardLabel("t", KITCHEN, Profile.PAPER, 7)
+
+
+@pytest.mark.timeout(180)
+async def test_blocks_of_the_adapters_page_upload_scenes_and_name_the_route(tmp_path):
+    dataset = write_kitchen_dataset(tmp_path / "dataset")
+    (upload,) = snippets("adapters.md", "OpenRLHF", "python")
+    (options,) = snippets("adapters.md", "OpenRLHF", "")
+    given = dict(zip(options.split()[::2], options.split()[1::2], strict=False))
+    route = given["--reward.remote_url"].removeprefix("http://HOST:8070")
+    async with (
+        manager(tmp_path) as at,
+        FakeWorker(at.address, slots=2),
+        http_at(at) as http,
+    ):
+        text = upload.replace("HOST:50070", at.address).replace("build/dataset", str(dataset))
+        names = {}
+        await eval(compile(text, "docs/adapters.md", "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT), names)
+        row = names["rows"](dataset)[0]
+        label, prompt = row[given["--data.label_key"]], row[given["--data.input_key"]][1]["content"]
+        answer = await http.post(route, json=asked("move 3", prompt=prompt, label=label))
+    assert answer.status_code == 200, answer.text
+    assert len(answer.json()["rewards"]) == 1

@@ -4,6 +4,7 @@ import json
 
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.documents import snippets
 from tests.fakes.peers import EXAMPLES, Peer
 from tests.fakes.real_cluster import RealCluster, connected
 
@@ -70,6 +71,31 @@ async def test_trl_trains_on_the_cluster_and_announces_the_next_scenes(cluster, 
     assert run.stats.prewarm_hits + run.stats.prewarm_misses > 0, "nothing was announced"
 
 
+TRL = """
+import sys
+block = sys.argv[1]
+exec(compile(block, "docs/adapters.md", "exec"), globals())
+trainer.train()
+print("trained", trainer.state.global_step)
+"""
+TRL_SETTINGS = "max_steps=1, per_device_train_batch_size=4, num_generations=2, report_to='none', use_cpu=True, bf16=False"
+
+
+async def test_trl_block_of_the_page_trains(cluster, dataset, tmp_path):
+    peer = Peer("trl", TORCH, "trl==1.16.0")
+    peer.run("-c", SMALL_MODEL, tmp_path / "model")
+    (block,) = snippets("adapters.md", "TRL", "python")
+    for printed, given in (
+        ("model=...", f"model={str(tmp_path / 'model')!r}"),
+        ("GRPOConfig(...", f"GRPOConfig(output_dir={str(tmp_path / 'out')!r}, {TRL_SETTINGS}"),
+        ("max_completion_length=1024", "max_completion_length=6"),  # seconds, not minutes
+        ("build/dataset", str(dataset)),
+    ):
+        assert printed in block
+        block = block.replace(printed, given)
+    assert "trained 1" in peer.run("-c", TRL, block, EMBOMATRIX_MANAGER=cluster[0].address)
+
+
 VERIFIERS = """
 import asyncio, json, sys
 sys.path.append(sys.argv[2])
@@ -125,9 +151,7 @@ class Letters:
     def decode(self, ids, skip_special_tokens):
         return "".join(map(chr, ids.tolist()))
 
-config = OmegaConf.create({"reward": {"custom_reward_function": {
-    "path": "pkg://embomatrix.trainer.adapters.verl", "name": "compute_score", "reward_kwargs": {"dataset": sys.argv[1]},
-}}})
+config = OmegaConf.from_dotlist([line.removeprefix("+") for line in sys.argv[2].split()])
 records = Dataset.load(sys.argv[1]).train
 oracles = {record.task.task_id: json.dumps([dict(call) for call in record.oracle]) for record in records}
 
@@ -161,7 +185,9 @@ async def test_verl_s_reward_manager_awaits_the_cluster(cluster, dataset):
         "datasets",
     )
     peer = Peer("verl", TORCH, *libraries, "verl==0.9.1")
-    printed = peer.run("-c", VERL, dataset, EMBOMATRIX_MANAGER=cluster[0].address)
+    (options,) = snippets("adapters.md", "verl", "")
+    options = options.replace("build/dataset", str(dataset))
+    printed = peer.run("-c", VERL, dataset, options, EMBOMATRIX_MANAGER=cluster[0].address)
     rows = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
     assert [each["success"] for each in rows] == [1, 1, 1, 0, 0, 0]
     assert all(each["score"] == each["format"] + each["relevance"] + each["goal"] for each in rows)

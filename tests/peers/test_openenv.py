@@ -4,21 +4,24 @@ import json
 
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.documents import snippets
 from tests.fakes.peers import PHYSICS, Peer
+
+from embomatrix.cli.local_cluster import free_port
 
 pytestmark = [pytest.mark.peers, pytest.mark.timeout(900)]
 TALK = """
-import json, sys, threading, time, uvicorn
+import json, socket, sys, threading, time
 from openenv import GenericEnvClient
-from embomatrix.envs.openenv import server
 from embomatrix.world.dataset import Dataset
 
-config = uvicorn.Config(server(sys.argv[1]), port=0, log_level="error")
-served = uvicorn.Server(config)
-threading.Thread(target=served.run, daemon=True).start()
-while not served.started:
-    time.sleep(0.05)
-port = served.servers[0].sockets[0].getsockname()[1]
+port = int(sys.argv[3])
+threading.Thread(target=exec, args=(compile(sys.argv[2], "docs/adapters.md", "exec"), {}), daemon=True).start()
+for _ in range(1200):
+    with socket.socket() as probe:
+        if probe.connect_ex(("127.0.0.1", port)) == 0:
+            break
+    time.sleep(0.1)
 for record in Dataset.load(sys.argv[1]).train:
     with GenericEnvClient(base_url=f"http://127.0.0.1:{port}").sync() as client:
         first = client.reset(seed=1, task_id=record.task.task_id)
@@ -31,14 +34,18 @@ for record in Dataset.load(sys.argv[1]).train:
             "unchanged": unknown.observation["state"] == first.observation["state"], "total": unknown.reward + done.reward,
             "done": done.done, "success": state["success"], "tiers": state["format"] + state["relevance"] + state["goal"],
         }))
-served.should_exit = True
 """
 
 
 def test_plans_go_through_openenv_s_server_and_come_back_scored(tmp_path):
     dataset = write_kitchen_dataset(tmp_path)
     peer = Peer("openenv", "openenv==0.10.0", "uvicorn", *PHYSICS)
-    rows = [json.loads(line) for line in peer.run("-c", TALK, dataset).splitlines() if line.startswith("{")]
+    (block,) = snippets("adapters.md", "OpenEnv", "python")
+    assert "port=8000" in block
+    port = free_port()
+    block = block.replace("build/dataset", str(dataset)).replace("port=8000", f"port={port}")
+    printed = peer.run("-c", TALK, dataset, block, port)
+    rows = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
     assert len(rows) == 3
     for each in rows:
         assert "Task: " in each["task"]

@@ -1,9 +1,8 @@
 """Episodes without a cluster: rewards equal those of whole plans, and observations reveal no goal."""
 
-from pathlib import Path
-
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.documents import snippets
 
 from embomatrix.envs.episode import SCENES_KEPT, Household
 from embomatrix.skills.failure import FailureReason
@@ -98,8 +97,7 @@ def test_few_scenes_are_kept_and_all_are_closed(tmp_path):
 
 
 def test_docs_example_runs(household, capsys):
-    page = (Path(__file__).parents[3] / "docs" / "adapters.md").read_text(encoding="utf-8")
-    example = page.split("## Plain Python\n\n```python\n")[1].split("```")[0]
+    (example,) = snippets("adapters.md", "Plain Python", "python")
     folder = household._dataset.folder
     exec(compile(example.replace("build/dataset", str(folder)), "adapters.md", "exec"), {})
     assert "Task: " in capsys.readouterr().out

@@ -1,7 +1,7 @@
 """Adapter for verl: its custom reward function.
 
-Set ``custom_reward_function.path`` to this file and ``custom_reward_function.name`` to ``compute_score``. verl scores each
-sample as soon as it is generated, so simulation and generation overlap.
+Set ``reward.custom_reward_function.path`` to this file and ``reward.custom_reward_function.name`` to ``compute_score``, as
+verl 0.9.1 reads them. verl scores each sample as soon as it is generated, so simulation and generation overlap.
 """
 
 from collections.abc import Mapping
@@ -25,8 +25,8 @@ async def compute_score(
 ) -> dict[str, float]:
     """Score one answer.
 
-    ``ground_truth`` is the task's id; the keyword arguments are ``custom_reward_function.reward_kwargs``. verl has no mark for
-    a missing reward, and NaN would spoil its step, so lost rollouts are repeated.
+    ``ground_truth`` is the task's id; the keyword arguments are ``reward.custom_reward_function.reward_kwargs``. verl has no
+    mark for a missing reward, and NaN would spoil its step, so lost rollouts are repeated.
     """
     named = dataset_named(dataset, "custom_reward_function.reward_kwargs.dataset")
     scorer = shared_scorer(named, manager, token, ca)
