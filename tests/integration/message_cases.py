@@ -106,6 +106,7 @@ _TEXTS = {
     "problems.jsonl": '{"name": "apple-0"}\n',
     "speed.toml": "speed = 3\n",
     "unfinished.toml": "speed =\n",
+    "long_plans.toml": "[grpo]\nmax_new = 2000\n",
     "rate.toml": '[grpo]\nlearning_rate = "fast"\n',
     "samples.toml": "samples = 0\n",
     "attic.toml": "cache_mbb = 3\n",
@@ -599,6 +600,12 @@ COMMANDS = (
         "train --settings=FILES/speed.toml --dataset=KITCHEN --out=FILES/new",
         "'speed'",
         "correct its name or remove it",
+    ),
+    CommandCase(
+        "plans longer than the model's context",
+        "train --settings=FILES/long_plans.toml --dataset=KITCHEN --out=FILES/new",
+        "grpo.max_new is 2000",
+        "lower one of grpo.max_new and prompt.rows",
     ),
     CommandCase(
         "settings that are not TOML",

@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import math
 import os
 import time
 from pathlib import Path
@@ -59,6 +60,7 @@ def demo(
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=dataset)
     with cluster.supervisor:
         _announce(cluster, slots)
+        minutes = _minutes(dataset, model, imitate_steps, steps)
         options = [
             f"--model={model}",
             f"--steps={steps}",
@@ -66,6 +68,13 @@ def demo(
             f"--seed={seed}",
             f"--evaluate-every={EVALUATE_EVERY}",
         ]
+        if minutes is not None:
+            console.print(
+                f"about {minutes} minutes on two cores: imitation, GRPO and evaluations. The clock only warns: the run "
+                "ends after its last step",
+                highlight=False,
+            )
+            options.append(f"--warn-after={max(0.0, minutes - (time.monotonic() - started_s) / 60)}")
         if threads:
             options.append(f"--threads={threads}")
         where = [f"--dataset={dataset}", f"--manager={cluster.address}", f"--out={folder}"]
@@ -80,6 +89,22 @@ def demo(
     if task_id:
         # Rich would wrap a line that is meant to be copied.
         typer.echo(f"try next: embomatrix play {task_id} --policy {folder} --dataset {dataset}")
+
+
+def _minutes(dataset: Path, model: str, imitation_steps: int, steps: int) -> int | None:
+    """Return the typical minutes of the run on two cores, None for a model other than `tiny`."""
+    from embomatrix.trainer.config.settings import EvaluationSettings
+    from embomatrix.trainer.config.typical_times import evaluations_during, typical_seconds
+
+    if model != "tiny":
+        return None
+    try:
+        tasks = len(Dataset.load(dataset).heldout)
+    except DatasetError:
+        return None  # `train` says what is wrong with it
+    settings = EvaluationSettings(every=EVALUATE_EVERY)
+    per_task = 2 * settings.samples + settings.samples_during * evaluations_during(settings, steps)
+    return math.ceil(typical_seconds(imitation_steps, steps, tasks * per_task) / 60)
 
 
 def _most_successful_task(folder: Path) -> str:

@@ -58,6 +58,15 @@ from embomatrix.trainer.evaluation.benchmark import Benchmark, find_benchmark
 from embomatrix.trainer.evaluation.exam import Question, WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import ScoreRow, read_row, report_of, text_report
+from embomatrix.trainer.policy.limits import (
+    ANSWER_TOKENS,
+    Limits,
+    Ruler,
+    check_context,
+    expressibility,
+    room_for,
+    sentence_about,
+)
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.task import MAX_TABLE, Profile
 from embomatrix.world.whole_file import write_whole
@@ -66,8 +75,8 @@ DEFAULT_OUT: Final = Path("runs/eval")
 REPORTS: Final = ("report.json", "report.txt", "report.html")
 REPORT_MARK: Final = b'"report": '
 """Part of the first bytes of each report.json."""
-ENDPOINT_TOKENS: Final = 1024
-"""Enough for a plan of 64 steps in JSON and some reasoning before it."""
+MAX_TOKENS: Final = "max_tokens"
+"""Name of the setting that limits an answer."""
 Exam = WorldExam | NativeExam
 console = Console(highlight=False, markup=False, soft_wrap=True)
 
@@ -85,7 +94,7 @@ class EvalSettings(BaseModel):
     tasks: int | None = Field(None, ge=1)
     """Evaluate only the first tasks."""
     max_tokens: int | None = Field(None, ge=1)
-    """Maximum tokens of an answer. Default: as the model was trained, 1024 for an endpoint."""
+    """Maximum tokens of an answer. Default: as the model was trained here, 1024 for all other models and endpoints."""
     codec: Codec | None = None
     """Plan format of a language model. Default: as it was trained here, else JSON."""
     profile: Profile = Profile.HOUSEHOLD
@@ -104,12 +113,16 @@ class EvalSettings(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Model, endpoint or baseline that is ready to answer, with its codec, maximum table rows and maximum tokens."""
+    """Model, endpoint or baseline that is ready to answer, with its codec, maximum table rows and maximum tokens.
+
+    ``ruler`` measures prompts and plans for it, None for a baseline.
+    """
 
     ask: Callable[[Sequence[Question], AnswerSheet, OnProgress], None]
     codec: Codec = Codec.JSON
     rows: int = MAX_TABLE
     max_tokens: int = 1
+    ruler: Ruler | None = None
 
 
 def _option(panel: str, *names: str, **options: Any) -> Any:
@@ -287,8 +300,11 @@ def _policy(exam: Exam, model: str, settings: EvalSettings) -> Subject:
         raise TrainerError(
             f"{model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
         )
-    ask = functools.partial(ask_policy, policy)
-    return Subject(ask, policy.codec, trained.prompt.rows, settings.max_tokens or trained.grpo.max_new)
+    ask, ruler = functools.partial(ask_policy, policy), Ruler.of_policy(policy)
+    prompts = {each.task_id: each.prompt for each in exam.questions(policy.codec, trained.prompt.rows)}
+    max_tokens = settings.max_tokens or room_for(trained.grpo.max_new, prompts, ruler)
+    check_context(prompts, max_tokens, ruler, MAX_TOKENS)
+    return Subject(ask, policy.codec, trained.prompt.rows, max_tokens, ruler)
 
 
 def _endpoint(url: str, model_name: str, key: str, settings: EvalSettings, folder: Path) -> Subject:
@@ -301,7 +317,8 @@ def _endpoint(url: str, model_name: str, key: str, settings: EvalSettings, folde
     limits = EndpointLimits(attempts=settings.attempts, concurrent=settings.concurrent)
     connect = functools.partial(Endpoint, url, model_name, api_key=key, limits=limits)
     ask = functools.partial(ask_endpoint, connect, folder / "ledger.jsonl")
-    return Subject(ask, settings.codec or Codec.JSON, max_tokens=settings.max_tokens or ENDPOINT_TOKENS)
+    codec, max_tokens = settings.codec or Codec.JSON, settings.max_tokens or ANSWER_TOKENS
+    return Subject(ask, codec, max_tokens=max_tokens, ruler=Ruler.of_endpoint(codec))
 
 
 def _baseline(
@@ -331,10 +348,21 @@ def _training_tasks(folder: Path) -> Dataset:
         raise TrainerError(str(error)) from error
 
 
+def _show_limits(exam: Exam, subject: Subject) -> None:
+    """Print the share of tasks that the subject can't express. EAI's own prompts have no oracle plans."""
+    if subject.ruler is None or isinstance(exam, NativeExam):
+        return
+    limits = Limits(subject.rows, subject.max_tokens)
+    tasks = tuple(exam.bench.tasks.values())
+    found = expressibility(tasks, limits, subject.ruler, refused=exam.by_rule)
+    console.print(sentence_about(found, f"tasks of {exam.name}", limits, MAX_TOKENS))
+
+
 def _ask(
     exam: Exam, subject: Subject, label: str, settings: EvalSettings, folder: Path
 ) -> tuple[EvaluationSetup, tuple[Answer, ...]]:
     """Collect the missing answers."""
+    _show_limits(exam, subject)
     questions = exam.questions(subject.codec, subject.rows)
     setup = EvaluationSetup(
         bench=exam.name,

@@ -177,14 +177,16 @@ def _plan_of_policy(named: str, situation: Situation, seed: int) -> Plan:
     from embomatrix.trainer.cluster.gateway import parse_policy_text
     from embomatrix.trainer.config.errors import TrainerError
     from embomatrix.trainer.evaluation.models import load_model
+    from embomatrix.trainer.policy.limits import Ruler, room_for
 
     try:
         policy, settings = load_model(named, None, threads=None, device="cpu")
+        asked = limited(situation, settings.prompt.rows)
+        prompt = prompt_for(asked, policy.codec)
+        max_new = room_for(settings.grpo.max_new, {situation.instruction: prompt}, Ruler.of_policy(policy))
     except TrainerError as error:
         fail(str(error))
-    asked = limited(situation, settings.prompt.rows)
-    prompt = policy.encode(prompt_for(asked, policy.codec))
-    drawn = policy.sample([prompt], 1, 0.0, settings.grpo.max_new, torch.Generator().manual_seed(seed))
+    drawn = policy.sample([policy.encode(prompt)], 1, 0.0, max_new, torch.Generator().manual_seed(seed))
     return parse_policy_text(drawn.texts[0], asked, policy.codec)
 
 

@@ -132,12 +132,16 @@ def limited(situation: Situation, rows: int) -> Situation:
     """
     if len(situation.rows) <= rows:
         return situation
+    return subset(situation, {row.index for row in ranked_rows(situation)[:rows]})
+
+
+def ranked_rows(situation: Situation) -> tuple[PromptRow, ...]:
+    """Return the rows in the order in which ``limited`` keeps them."""
     text = f" {plain_words(situation.instruction)} "
     by_name = {row.name: row for row in situation.rows}
     named = [row for row in situation.rows if f" {plain_words(row.category)} " in text]
     hosts = [by_name[row.host] for row in named if row.host in by_name]
-    ranked = dict.fromkeys([*named, *hosts, *situation.rows])
-    return subset(situation, {row.index for row in list(ranked)[:rows]})
+    return tuple(dict.fromkeys([*named, *hosts, *situation.rows]))
 
 
 def subset(situation: Situation, kept: Iterable[int]) -> Situation:

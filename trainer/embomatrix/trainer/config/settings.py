@@ -116,7 +116,10 @@ class PromptSettings(_Frozen):
     """Contents of prompts, and their variation during training."""
 
     rows: int = Field(default=16, ge=1)
-    """Maximum rows of the object table. Rows that the instruction names come first."""
+    """Maximum rows of the object table. Rows that the instruction names come first.
+
+    If it is not given, a new run takes the fewest rows that hold the objects of every oracle plan for training.
+    """
     rename_share: float = Field(default=0.8, ge=0, le=1)
     """Share of imitation examples with renamed object categories (word-level policy only)."""
     practice_rename_share: float = Field(default=0.0, ge=0, le=1)
@@ -176,7 +179,7 @@ class GrpoSettings(_Frozen):
     """The learning rate decays linearly to this share of itself."""
     temperature: float = Field(default=1.0, gt=0)
     max_new: int = Field(default=72, ge=1)
-    """Maximum tokens of a plan."""
+    """Maximum tokens of a plan. If it is not given, a new run takes 1.5 times the longest oracle plan for training."""
     loss: LossKind = LossKind.DAPO
     ratio: RatioLevel = RatioLevel.TOKEN
     clip_low: float = Field(default=0.2, gt=0, lt=1)
@@ -289,7 +292,6 @@ class TrainSettings(_Frozen):
 
 
 LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
-    "prompt.rows": 28,
     "prompt.rename_share": 0.0,
     "imitation.batch": 4,
     "imitation.chunk": 1,
@@ -298,7 +300,6 @@ LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "grpo.tasks_per_step": 4,
     "grpo.chunk": 1,
     "grpo.learning_rate": 1e-5,
-    "grpo.max_new": 96,
     "grpo.zero_variance": "keep",
 }
 """Defaults that differ for a pretrained model: it already knows words, it needs more memory, and TRL's updates keep

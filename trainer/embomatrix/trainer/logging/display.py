@@ -13,43 +13,23 @@ from rich.table import Table
 from rich.text import Text
 
 from embomatrix.trainer.grpo.records import StepRecord
+from embomatrix.trainer.logging.run_clock import Phase, RunClock
 
 if TYPE_CHECKING:
     from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
     from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
 
 _LINE_INTERVAL_S: Final = 10.0
-_GUESS_AFTER_S: Final = 5.0
-"""Seconds of a phase after which its remaining time is shown."""
-
-
-class RemainingTime:
-    """Estimate of the time that a phase will still take, from the time of its share so far."""
-
-    def __init__(self) -> None:
-        self._phase = ""
-        self._began_s = 0.0
-        self._began_at = 0.0
-
-    def guess_s(self, phase: str, share: float) -> float | None:
-        """Return seconds, None at the beginning of a phase. A resumed phase may begin at any share."""
-        now_s = time.monotonic()
-        if phase != self._phase:
-            self._phase, self._began_s, self._began_at = phase, now_s, share
-        spent_s, done = now_s - self._began_s, share - self._began_at
-        if spent_s < _GUESS_AFTER_S or done <= 0:
-            return None
-        return spent_s * max(0.0, 1.0 - share) / done
 
 
 class LineDisplay:
-    """Context manager that prints at most one line per ``_LINE_INTERVAL_S``."""
+    """Context manager that prints at most one line per ``_LINE_INTERVAL_S``. Without a ``clock`` no time is shown."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, clock: RunClock | None = None) -> None:
         self._console = console
         self._printed_s = -_LINE_INTERVAL_S
         self._validation = ""
-        self._remaining = RemainingTime()
+        self._clock = clock or RunClock({}, began_s=time.monotonic())
 
     def __enter__(self) -> Self:
         return self
@@ -62,9 +42,11 @@ class LineDisplay:
             self._validation = f"{progress.validation:.3f}"
         if self._validation:
             figures["validation loss"] = self._validation
+        self._clock.note(Phase.IMITATION, progress.share, time.monotonic())
         self._show("imitation", progress.share, figures)
 
     def evaluating(self, label: str, done: int, total: int) -> None:
+        self._clock.note_evaluation(label, done, total, time.monotonic())
         self._show(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})
 
     def evaluated(self, label: str, result: HeldOutEvaluation) -> None:
@@ -81,24 +63,28 @@ class LineDisplay:
             "entropy": "–" if record.entropy is None else f"{record.entropy:.2f}",
             "zero-variance groups": f"{record.zero_variance_groups:.0%}",
         }
+        self._clock.note(Phase.GRPO, share, time.monotonic())
         self._show("GRPO", share, figures)
 
     def _show(self, title: str, share: float, figures: Mapping[str, str]) -> None:
         now_s = time.monotonic()
-        left = self._left(title, share)
+        self._warn_if_late(now_s)
         if now_s - self._printed_s >= _LINE_INTERVAL_S:
             self._printed_s = now_s
-            self._print(
-                f"{title} {share:.0%}{left}: {', '.join(f'{name} {value}' for name, value in figures.items())}"
-            )
+            shown = ", ".join(f"{name} {value}" for name, value in figures.items())
+            self._print(f"{title} {share:.0%}{self._left()}: {shown}")
 
-    def _left(self, title: str, share: float) -> str:
-        """Return the remaining time of the phase in words, empty if it can't be guessed yet."""
-        guess_s = self._remaining.guess_s(title, share)
-        if guess_s is None:
-            return ""
-        minutes, seconds = divmod(round(guess_s), 60)
-        return f", {minutes} min {seconds:02} s left" if minutes else f", {seconds} s left"
+    def _left(self) -> str:
+        """Return the remaining time of the run in words, empty if it can't be guessed yet."""
+        left_s = self._clock.left_s()
+        return "" if left_s is None else f", {_in_words(left_s)} of the run left"
+
+    def _warn_if_late(self, now_s: float) -> None:
+        if self._clock.is_late(now_s):
+            self._print(
+                f"warning: the run takes longer than announced{self._left()}. It goes on. Other work on this machine slows it "
+                "down; Ctrl-C saves a checkpoint, and `embomatrix train --resume` continues from it"
+            )
 
     def _print(self, text: str) -> None:
         self._console.print(text, highlight=False, markup=False)
@@ -107,8 +93,8 @@ class LineDisplay:
 class LiveDisplay(LineDisplay):
     """Panel that is redrawn in place."""
 
-    def __init__(self, console: Console) -> None:
-        super().__init__(console)
+    def __init__(self, console: Console, clock: RunClock | None = None) -> None:
+        super().__init__(console, clock)
         self._live = Live(Text("starting"), console=console, refresh_per_second=4)
 
     def __enter__(self) -> Self:
@@ -119,15 +105,21 @@ class LiveDisplay(LineDisplay):
         self._live.__exit__(None, None, None)
 
     def _show(self, title: str, share: float, figures: Mapping[str, str]) -> None:
+        self._warn_if_late(time.monotonic())
         table = Table.grid(padding=(0, 2))
         table.add_row(*(Text(name, style="dim") for name in figures))
         table.add_row(*figures.values())
         share = min(1.0, share)
         bar = ProgressBar(total=1.0, completed=share, width=60)
-        shown = f"{title}  {share:.0%}{self._left(title, share)}"
+        shown = f"{title}  {share:.0%}{self._left()}"
         self._live.update(Group(Text(shown, style="bold"), bar, table))
 
 
-def display_on(console: Console) -> LineDisplay:
+def display_on(console: Console, clock: RunClock) -> LineDisplay:
     """Return a live panel on a terminal, else plain lines."""
-    return LiveDisplay(console) if console.is_terminal else LineDisplay(console)
+    return LiveDisplay(console, clock) if console.is_terminal else LineDisplay(console, clock)
+
+
+def _in_words(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02} s" if minutes else f"{rest} s"

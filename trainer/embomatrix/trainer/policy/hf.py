@@ -68,6 +68,7 @@ class HfPolicy:
         self._gradient_checkpointing = gradient_checkpointing
         self._has_adapters = False
         self._tokenizer = tokenizer
+        self.context = _context_of(model)
         self._end = _end_tokens(model, tokenizer)
         self._pad = self._end[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
 
@@ -153,6 +154,12 @@ class HfPolicy:
 
     def encode_plan(self, text: str) -> Tokens:
         return (*self._tokens(text), self._end[0])
+
+    def unknown_words(self, text: str) -> frozenset[str]:
+        unknown = self._tokenizer.unk_token_id
+        if unknown is None or unknown not in self._tokens(text):
+            return frozenset()
+        return frozenset(word for word in text.split() if unknown in self._tokens(word))
 
     def _tokens(self, text: str) -> Tokens:
         return tuple(self._tokenizer(text, add_special_tokens=False)["input_ids"])
@@ -355,6 +362,12 @@ def _checkpointed_layers(model: nn.Module) -> Iterator[None]:
     finally:
         for layer in layers:
             layer.__dict__.pop("forward", None)
+
+
+def _context_of(model: Any) -> int | None:
+    """Return the longest sequence of a model, None if its configuration has no limit. A model with images has it for texts."""
+    longest = getattr(model.config.get_text_config(), "max_position_embeddings", None)
+    return None if longest is None else int(longest)
 
 
 def _end_tokens(model: Any, tokenizer: Any) -> list[int]:

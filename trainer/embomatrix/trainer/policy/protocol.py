@@ -53,12 +53,21 @@ class Policy(Protocol):
     @property
     def module(self) -> nn.Module: ...
 
+    @property
+    def context(self) -> int | None:
+        """Maximum tokens of a prompt and a plan together. None: no limit is known."""
+        ...
+
     def encode(self, prompt: Prompt) -> Tokens:
         """Return the tokens of a prompt, up to where the plan begins."""
         ...
 
     def encode_plan(self, text: str) -> Tokens:
         """Return the tokens of a plan with its end token: the target of imitation."""
+        ...
+
+    def unknown_words(self, text: str) -> frozenset[str]:
+        """Return the words of a plan that the policy can't write."""
         ...
 
     def sample(

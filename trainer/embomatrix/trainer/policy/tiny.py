@@ -95,6 +95,10 @@ class TinyPolicy:
         self.device = torch.device(device)
         self._grammar = PlanGrammar(vocabulary, self.device)
 
+    @property
+    def context(self) -> int:
+        return self.module.shape.longest
+
     def parameters(self) -> Iterator[nn.Parameter]:
         return self.module.parameters()
 
@@ -106,6 +110,9 @@ class TinyPolicy:
 
     def encode_plan(self, text: str) -> Tokens:
         return (*self.vocabulary.encode(text), END)
+
+    def unknown_words(self, text: str) -> frozenset[str]:
+        return self.vocabulary.unknown_words(text)
 
     @torch.no_grad()
     def sample(

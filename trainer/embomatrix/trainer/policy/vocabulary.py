@@ -136,6 +136,12 @@ class Vocabulary:
         singular = word.removesuffix("s")
         return [self.index.get(singular, UNKNOWN)]
 
+    def unknown_words(self, text: str) -> frozenset[str]:
+        """Return the words of a text that become ``<unknown>``."""
+        if UNKNOWN not in self.encode(text):
+            return frozenset()
+        return frozenset(word for word in _WORD.findall(text.lower()) if UNKNOWN in self._word(word))
+
     def decode(self, tokens: Iterable[int]) -> str:
         """Decode up to the end token. Numbers join the word before: ``apple`` ``_2`` becomes ``apple_2``."""
         parts: list[str] = []

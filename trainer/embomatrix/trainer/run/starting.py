@@ -28,6 +28,7 @@ from embomatrix.trainer.logging.outcome import OUTCOME
 from embomatrix.trainer.logging.recorder import IMITATION, METRICS, SAMPLES
 from embomatrix.trainer.logging.report import REPORT
 from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.limits import Limits, Ruler, expressibility, sentence_about, with_limits
 from embomatrix.trainer.policy.loading import TINY, configure_torch, is_word_level, new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
@@ -68,6 +69,21 @@ class RunStart:
         variation = Variation(self.tasks.kinds, prompt.rename_share, prompt.drop_share)
         return PromptBuilder(self.policy, prompt.rows, variation, prompt.practice_rename_share)
 
+    @property
+    def about_limits(self) -> tuple[str, ...]:
+        """Sentences about the limits of prompts and plans, and about the tasks that can't be expressed within them."""
+        limits = Limits(self.settings.prompt.rows, self.settings.grpo.max_new)
+        ruler = Ruler.of_policy(self.policy)
+        splits = {"training tasks": self.tasks.train, "held-out tasks": self.tasks.heldout}
+        return (
+            f"limits: {limits.rows} object rows in a prompt (prompt.rows), {limits.max_new} tokens in a plan (grpo.max_new)",
+            *(
+                sentence_about(expressibility(tasks, limits, ruler), named, limits, "grpo.max_new")
+                for named, tasks in splits.items()
+                if tasks
+            ),
+        )
+
 
 def start_run(
     dataset: Path, out: Path, model: str, settings_file: Path | None, changes: Mapping[str, Any]
@@ -83,6 +99,7 @@ def start_run(
     configure_torch(settings.threads, settings.device)
     tasks = load_tasks(dataset)
     policy = new_policy(settings, tasks)
+    settings = with_limits(settings, policy, tasks)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
