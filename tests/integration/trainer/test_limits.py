@@ -166,13 +166,13 @@ def test_prompt_beyond_the_model_s_context_is_refused_before_the_run(kitchen, tm
         TrainerError, match=r"prompt of the task '\w+' has \d+ tokens, but the model's context has 64"
     ):
         with_limits(read_settings(None, {}, LANGUAGE_MODEL_DEFAULTS), short, tasks)
-    longest = max(
-        len(short.encode(prompt)) for prompt in prompts_of(tasks.train, MAX_TABLE, Codec.LINES).values()
-    )
-    llama.config.max_position_embeddings = longest + 5
+    prompts = prompts_of((*tasks.train, *tasks.heldout), MAX_TABLE, Codec.LINES).values()
+    llama.config.max_position_embeddings = max(len(short.encode(prompt)) for prompt in prompts) + 5
     near = HfPolicy(llama, tokenizer, Codec.LINES, "near")
-    assert with_limits(read_settings(None, {}, LANGUAGE_MODEL_DEFAULTS), near, tasks).grpo.max_new <= 5
-    given = read_settings(None, {"grpo.max_new": 6}, LANGUAGE_MODEL_DEFAULTS)
+    whole_table = {"prompt.rows": MAX_TABLE}
+    derived = with_limits(read_settings(None, whole_table, LANGUAGE_MODEL_DEFAULTS), near, tasks)
+    assert derived.grpo.max_new == 5
+    given = read_settings(None, {**whole_table, "grpo.max_new": 6}, LANGUAGE_MODEL_DEFAULTS)
     with pytest.raises(
         TrainerError, match=r"leaves 5 of the model's context of \d+, and grpo\.max_new is 6: lower"
     ):
