@@ -171,7 +171,10 @@ def test_worker_joins_and_the_documented_commands_train_and_copy_the_results(tmp
         found = http.get("/api/v1/workers").json()["items"]
         assert [each["state"] for each in found] == ["ready"]
         in_trainer(WRITE_TASKS, tmp_path)
-        in_trainer(TRAIN, tmp_path, "--steps=1", "--imitate-steps=2", EMBOMATRIX_MANAGER=address)
+        few = tmp_path / "few.toml"  # one answer for each of 200 held-out tasks: ten take minutes
+        few.write_text("[evaluation]\nsamples = 1\n")
+        options = ("--steps=1", "--imitate-steps=2", f"--settings={few}")
+        in_trainer(TRAIN, tmp_path, *options, EMBOMATRIX_MANAGER=address)
     assert COPY_RESULTS.startswith("docker compose run --rm -T --no-deps --entrypoint=tar trainer ")
     copy = COPY_RESULTS.partition(" trainer ")[2].replace(" / ", f" {shlex.quote(str(tmp_path))} ")
     (tmp_path / "here").mkdir()

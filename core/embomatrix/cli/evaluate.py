@@ -222,6 +222,7 @@ def evaluate(
                 subject = _policy(exam, model, settings)
             else:
                 subject = _endpoint(endpoint, model_name, key, settings, folder)
+            _prepare_reports(folder)
             setup, given = _ask(exam, subject, label, settings, folder)
             _judge(exam, setup, given, folder, rows)
 
@@ -416,18 +417,23 @@ def _judge_stored(
         if len(given) < expected:
             missing = expected - len(given)
             console.print(f"{missing} of {expected} answers are missing: the figures leave them out")
+        _prepare_reports(out or path.parent)
         _judge(exam, setup, given, out or path.parent, [read_row(row, exam.digest) for row in beside])
 
 
 def _check_reports(folder: Path) -> None:
-    """Make the folder of the reports. Raise TrainerError if one would replace a file that no evaluation wrote."""
-    prepare_output("eval", *(folder / name for name in REPORTS))
+    """Raise TrainerError if a report would replace a file that no evaluation wrote."""
     if is_own(folder / FILE, HEADER) or is_own(folder / REPORTS[0], REPORT_MARK):
         return
     if found := [folder / name for name in REPORTS if (folder / name).exists()]:
         raise TrainerError(
             f"{found[0]} was not written by an evaluation: pass another --out, or move it away"
         )
+
+
+def _prepare_reports(folder: Path) -> None:
+    """Make the folder of the reports once nothing else can be refused, or refuse it before the work begins."""
+    prepare_output("eval", *(folder / name for name in REPORTS))
 
 
 def _judge(

@@ -62,7 +62,7 @@ CHECKED = Counter(
     }
 )
 """Blocks with a language, by page, and the tests that check them."""
-NOT_COMMANDS = ("custom_reward_function.", "--reward.remote_url", "reward = ", "format ")
+NOT_COMMANDS = ("reward.custom_reward_function.", "--reward.remote_url", "reward = ", "format ")
 """Beginnings of blocks without a language that are settings of other programs, or formulas."""
 ELSEWHERE = {
     r"^(make|pip|source|docker|PYTHONPATH=|ACCESS=)": "prepares the machine",
@@ -212,7 +212,7 @@ def test_refusal_of_a_house_is_the_printed_one(tmp_path: Path, monkeypatch: pyte
 def test_plan_of_the_readme_earns_the_printed_reward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (plan,) = re.findall(r"```plan\n(.*?)```", readme, re.DOTALL)
-    (task,) = re.findall(r"embomatrix play (\S+) --oracle", readme)
+    (task,) = re.findall(r"embomatrix play (\w+-heldout-\S+) --oracle", readme)
     monkeypatch.chdir(tmp_path)  # without a dataset: of the shipped tasks
     monkeypatch.delenv("EMBOMATRIX_DATASET", raising=False)
     Path("plan.txt").write_text(plan)

@@ -251,7 +251,8 @@ def test_unknown_film_suffix_is_refused_before_execution(run):
 
 
 def test_unwritable_film_is_refused_before_execution(run, tmp_path):
-    result = run("apple_to_counter", "--oracle", "--film", str(tmp_path / "nowhere" / "film.gif"))
+    (tmp_path / "file").touch()
+    result = run("apple_to_counter", "--oracle", "--film", str(tmp_path / "file" / "film.gif"))
     assert result.exit_code == 2
     assert "film.gif can't be written" in " ".join(result.output.split())
     assert "✓" not in result.output
