@@ -293,7 +293,7 @@ def _lines(out):
 def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     out = tmp_path / "out"
     arguments = (
-        "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=8", "--heldout=0", "--no-look-ahead"
+        "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=8", "--heldout=0", "--no-reachability"
     )  # fmt: skip
     with background(tmp_path / "log", *arguments) as building:
         building.wait_for((out / "build.jsonl").exists)
@@ -303,6 +303,6 @@ def test_interrupted_build_leaves_no_dataset_and_resumes(tmp_path):
     )
     assert not (out / "tasks.jsonl").exists()
     other = run(
-        "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-look-ahead"
+        "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-reachability"
     )
     assert_ended(other, 2, "holds a run with other settings (train 8, now 9): give the same settings again")

@@ -40,7 +40,7 @@ class Run:
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     dataset, out = folder / "dataset", folder / "out"
-    _run("factory", "build", f"--out={dataset}", "--train=8", "--heldout=2", "--no-look-ahead")
+    _run("factory", "build", f"--out={dataset}", "--train=8", "--heldout=2", "--no-reachability")
     cluster = local_cluster(folder / "cluster", workers=2, slots=1)
     with cluster.supervisor as children:
         until_listening(cluster.address)

@@ -223,7 +223,7 @@ def test_proofs_that_are_no_dataset_are_refused_before_a_build(shipping, tmp_pat
 
 
 def test_all_parts_are_proved_and_gardens_of_held_out_homes_are_held_out(tmp_path):
-    assert all(settings_of(recipe).physical and settings_of(recipe).look_ahead for recipe in PARTS.values())
+    assert all(settings_of(recipe).physical and settings_of(recipe).reachability for recipe in PARTS.values())
     unpack(tmp_path)
     homes = {base_scene_of(record.task.scene_id) for record in Dataset.load(tmp_path).heldout}
     gardens = {scene.replace("_int", "_garden") for scene in homes & {*PARTS[1].scenes}}

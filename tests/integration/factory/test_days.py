@@ -139,7 +139,7 @@ def test_training_has_no_need_and_no_goal_shape_of_the_held_out_split(bases: dic
 
 
 def test_a_day_depends_only_on_settings_and_order() -> None:
-    settings = BuildSettings(look_ahead=False, physical=False, writer=WriterKind.SOCIAL)
+    settings = BuildSettings(reachability=False, physical=False, writer=WriterKind.SOCIAL)
     rooms = tuple(room.name for room in build_base_scene("Pomaria_1_int").rooms)
     order = VariantOrder("train", 3, "Pomaria_1_int", rooms, dict.fromkeys(TaskCategory, 10), frozenset())
     first, second = DayMaker(settings), DayMaker(settings)
@@ -158,7 +158,7 @@ def test_a_day_depends_only_on_settings_and_order() -> None:
 def test_tasks_that_differ_only_in_words_keep_their_proofs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = BuildSettings(look_ahead=False, physical=False, writer=WriterKind.SOCIAL)
+    settings = BuildSettings(reachability=False, physical=False, writer=WriterKind.SOCIAL)
     base = build_base_scene("Pomaria_1_int")
     rooms = tuple(room.name for room in base.rooms)
     order = VariantOrder("train", 3, "Pomaria_1_int", rooms, dict.fromkeys(TaskCategory, 10), frozenset())
@@ -213,7 +213,7 @@ def test_a_dataset_of_days_is_complete_and_resumes(tmp_path: Path) -> None:
         seed=1,
         scenes=("Pomaria_1_int",),
         writer=WriterKind.SOCIAL,
-        look_ahead=False,
+        reachability=False,
         physical=False,
     )
     build_dataset(tmp_path / "one", settings, making=DAYS)

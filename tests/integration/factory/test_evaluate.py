@@ -354,7 +354,7 @@ def test_ledger_gives_the_admitted_share(tmp_path):
 
 def a_build(folder, writer, times):
     """Write a build of two variants with three admitted tasks and one refused task, and its file of times."""
-    settings = {"settings": {"writer": writer, "look_ahead": True, "physical": False}}
+    settings = {"settings": {"writer": writer, "reachability": True, "physical": False}}
     drafts = [(0, "admitted"), (0, "admitted"), (0, "no_plan"), (1, "admitted")]
     lines = [
         {"split": "train", "variant": number, "scene": "Rs_int-train-000", "outcome": outcome}
@@ -380,7 +380,7 @@ def test_admission_rate_uses_recorded_times_of_variants_and_base_scenes(tmp_path
     pace = found.figure("admitted_per_hour")
     assert (pace.value, pace.n, pace.is_reached) == (2 * 3600 * 2 / 8.0, 2, True)
     assert found.notes == ("Rejected drafts: no_plan 1.",)
-    assert found.conditions["look ahead"] == "yes"
+    assert found.conditions["reachability"] == "yes"
     assert "| admitted_per_hour |" in with_factory("", [found])
 
 

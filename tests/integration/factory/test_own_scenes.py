@@ -26,7 +26,7 @@ from embomatrix.world.scene import Scene
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "two_bedroom_flat.toml"
 CREDIT = Credit("A. Maker", "CC0-1.0", "https://example.org")
-QUICK = ("--no-look-ahead", "--jobs", "1")
+QUICK = ("--no-reachability", "--jobs", "1")
 APPLE = """(define (problem Put_the_apple_in_the_fridge) (:domain omnigibson)
   (:objects apple.n.01_1 - apple.n.01 electric_refrigerator.n.01_1 - electric_refrigerator.n.01
             breakfast_table.n.01_1 - breakfast_table.n.01)
@@ -89,7 +89,7 @@ def test_dataset_of_a_scene_file_is_complete_elsewhere(built: Path, house: Scene
 
 def test_file_of_a_base_scene_gives_the_tasks_of_its_name(tmp_path: Path) -> None:
     base = build_base_scene("Benevolence_1_int")
-    settings = BuildSettings(2, 0, scenes=(base.base,), look_ahead=False, physical=False)
+    settings = BuildSettings(2, 0, scenes=(base.base,), reachability=False, physical=False)
     build_dataset(tmp_path / "named", settings)
     build_dataset(tmp_path / "file", settings, own={base.base: base})
     named, of_file = (tmp_path / name / TASKS_FILE for name in ("named", "file"))
@@ -108,7 +108,7 @@ def test_another_seed_of_a_base_scene_gives_other_tasks(tmp_path: Path) -> None:
 def test_processes_get_the_scene_of_the_file(built: Path, file: Path, tmp_path: Path) -> None:
     folder = tmp_path / "two"
     line = ("build", "--out", folder, "--train", 8, "--heldout", 0, "--scenes", file)
-    code, output = run(*line, "--no-look-ahead", "--jobs", 2)
+    code, output = run(*line, "--no-reachability", "--jobs", 2)
     assert code == 0, output
     assert (folder / TASKS_FILE).read_bytes() == (built / TASKS_FILE).read_bytes()
 
@@ -133,7 +133,7 @@ def test_build_resumes_with_the_same_file_only(built: Path, file: Path, house: S
 
 def test_name_and_file_of_one_scene_do_not_resume_each_other(tmp_path: Path) -> None:
     base = build_base_scene("Benevolence_1_int")
-    settings = BuildSettings(0, 0, scenes=(base.base,), look_ahead=False, physical=False)
+    settings = BuildSettings(0, 0, scenes=(base.base,), reachability=False, physical=False)
     build_dataset(tmp_path / "named", settings)
     with pytest.raises(DatasetError, match="of the catalog, not of a file"):
         build_dataset(tmp_path / "named", settings, own={base.base: base})

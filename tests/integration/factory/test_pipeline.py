@@ -44,7 +44,7 @@ from embomatrix.world.task import Task, TaskCategory
 
 TASKS_DIGEST = "b7a659e75981901243066c44f18dee3db252eb3fb4921b6254419d30698e74ee"
 """SHA-256 of the task records of `SETTINGS` without the digests of their bundles."""
-QUICK = {"look_ahead": False, "physical": False}
+QUICK = {"reachability": False, "physical": False}
 SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"), **QUICK)
 
 BDDL = """(define (problem Put_the_apple_in_the_fridge)
@@ -321,7 +321,7 @@ def test_list_selects_tasks_and_shows_them_in_pages(folder: Path, dataset: Datas
 def test_bddl_file_is_imported_and_its_plan_printed(tmp_path: Path) -> None:
     (tmp_path / "apple.bddl").write_text(BDDL)
     file, out = str(tmp_path / "apple.bddl"), str(tmp_path / "d")
-    code, output = run("import", "--bddl", file, "--scene", "Rs_int", "--out", out, "--no-look-ahead")
+    code, output = run("import", "--bddl", file, "--scene", "Rs_int", "--out", out, "--no-reachability")
     assert code == 0, output
     assert "Put the apple in the fridge." in output
     assert "pick_up" in output
@@ -376,7 +376,7 @@ def test_unknown_names_exit_with_2_and_one_sentence(
 
 def test_conversation_tasks_are_proved_in_physics_and_keep_transcripts(tmp_path):
     settings = BuildSettings(
-        train=2, heldout=0, seed=13, scenes=("Pomaria_1_int",), writer=WriterKind.SOCIAL, look_ahead=False
+        train=2, heldout=0, seed=13, scenes=("Pomaria_1_int",), writer=WriterKind.SOCIAL, reachability=False
     )
     summary = build_dataset(tmp_path, settings, making=DAYS)
     dataset = Dataset.load(tmp_path)

@@ -94,7 +94,7 @@ def test_template_script_solves_at_least_nine_in_ten_held_out_tasks_of_the_old_c
         f"--out={tmp_path / 'old'}",
         "--train=240",
         "--heldout=40",
-        "--no-look-ahead",
+        "--no-reachability",
         "--jobs=2",
     )
     assert CliRunner().invoke(app, built).exit_code == 0

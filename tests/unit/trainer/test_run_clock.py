@@ -36,6 +36,15 @@ def test_remaining_time_of_a_measured_phase_follows_its_own_speed():
     assert clock.left_s() == pytest.approx(200.0)
 
 
+def test_slow_first_steps_of_a_phase_are_no_measure_of_its_speed():
+    clock = clock_with(imitation=PhaseTime(typical_s=100.0), evaluation=PhaseTime(typical_s=20.0))
+    clock.note(Phase.IMITATION, 0.01, now_s=30.0)
+    assert clock.left_s() is None
+    clock.note(Phase.IMITATION, 1.0, now_s=100.0)
+    clock.note(Phase.EVALUATION, 0.01, now_s=130.0)
+    assert clock.left_s() == pytest.approx(0.99 * 20.0)
+
+
 def test_budget_of_time_is_the_same_on_a_slow_machine():
     clock = clock_with(imitation=PhaseTime(typical_s=10.0), grpo=PhaseTime(budget_s=300.0))
     clock.note(Phase.IMITATION, 0.5, now_s=50.0)

@@ -43,7 +43,7 @@ def hunt_shortcuts(sizes: HuntSizes, on_step: Callable[[str], None]) -> tuple[Fi
             heldout=0,
             seed=sizes.seed,
             writer=writer,
-            look_ahead=False,
+            reachability=False,
             physical=False,
         )
         with tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name:

@@ -30,7 +30,7 @@ from embomatrix.factory.commands.language_model import (
 )
 from embomatrix.factory.commands.layout import lay
 from embomatrix.factory.commands.merge import merge
-from embomatrix.factory.commands.options import Jobs, LookAhead, Physical, Scenes, Seed, in_physics
+from embomatrix.factory.commands.options import ArmReachability, Jobs, Physical, Scenes, Seed, in_physics
 from embomatrix.factory.commands.starter import starter
 from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
@@ -91,7 +91,7 @@ def build(
     seed: Seed = 0,
     scenes: Scenes = None,
     jobs: Jobs = None,
-    look_ahead: LookAhead = True,
+    reachability: ArmReachability = True,
     physical: Physical = None,
     forms: Forms = None,
     llm: Llm = "",
@@ -115,8 +115,8 @@ def build(
             heldout,
             seed,
             chosen.names,
-            look_ahead=look_ahead,
-            physical=in_physics(physical, look_ahead=look_ahead),
+            reachability=reachability,
+            physical=in_physics(physical, reachability=reachability),
             modelled=tuple(sorted(model_backed)),
         )
         make_dataset(out, settings, jobs=jobs, layout=layout, own=chosen.own)
@@ -130,7 +130,7 @@ def generate(
     seed: Seed = 0,
     scenes: Scenes = None,
     jobs: Jobs = None,
-    look_ahead: LookAhead = True,
+    reachability: ArmReachability = True,
     physical: Physical = None,
     forms: Forms = None,
     llm: SocialLlm = "",
@@ -160,8 +160,8 @@ def generate(
         seed,
         chosen.names,
         kind,
-        look_ahead=look_ahead,
-        physical=in_physics(physical, look_ahead=look_ahead),
+        reachability=reachability,
+        physical=in_physics(physical, reachability=reachability),
         modelled=tuple(sorted([*model_backed, *[SCENE_EXTRACTOR] * look])),
     )
     with contextlib.ExitStack() as stack:

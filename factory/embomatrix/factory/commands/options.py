@@ -14,7 +14,7 @@ Scenes = Annotated[
         help="Base scene, 'all', or a .json file of `scene build`. Repeat the option for more scenes.",
     ),
 ]
-LookAhead = Annotated[
+ArmReachability = Annotated[
     bool,
     typer.Option(
         help="Analyse which objects the robot's arm can reach in each scene, and store it for rollouts. "
@@ -25,7 +25,7 @@ Physical = Annotated[
     bool | None,
     typer.Option(
         "--physical/--no-physical",
-        help="Admit a task only if a robot carries its plan out in stepped physics. Default: same as --look-ahead.",
+        help="Admit a task only if a robot carries its plan out in stepped physics. Default: same as --reachability.",
     ),
 ]
 MOST_JOBS: Final = 8
@@ -39,9 +39,9 @@ Jobs = Annotated[
 ]
 
 
-def in_physics(physical: bool | None, *, look_ahead: bool) -> bool:
-    """Return whether plans are checked in stepped physics: ``--physical``, or ``--look-ahead`` if it is not given."""
-    return look_ahead if physical is None else physical
+def in_physics(physical: bool | None, *, reachability: bool) -> bool:
+    """Return whether plans are checked in stepped physics: ``--physical``, or ``--reachability`` if it is not given."""
+    return reachability if physical is None else physical
 
 
 def processes(jobs: int | None) -> int:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from embomatrix.factory.admission import TaskRefusal
-from embomatrix.factory.commands.options import Jobs, LookAhead, Scenes, Seed, processes
+from embomatrix.factory.commands.options import ArmReachability, Jobs, Scenes, Seed, processes
 from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
 from embomatrix.factory.metrics.figures import EvaluationFigures, write_evaluation
 from embomatrix.factory.pipeline.settings import DEFAULT_SCENES
@@ -87,7 +87,7 @@ def import_(
     instantiate: Instantiate = False,
     reached_by: ReachedBy = None,
     solids: Solids = False,
-    look_ahead: LookAhead = True,
+    reachability: ArmReachability = True,
     report: Report = None,
     json_file: Rates = None,
     outcomes: Kept = None,
@@ -106,7 +106,7 @@ def import_(
         if out is not None:
             _check_free(out, depth, outcomes)
         sources = _selected(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
-        settings = ImportSettings(base_scenes(scenes or DEFAULT_SCENES), seed, depth, look_ahead)
+        settings = ImportSettings(base_scenes(scenes or DEFAULT_SCENES), seed, depth, reachability)
         if out is not None:
             check_scenes_free(out, settings.scenes.own.values())
         log = _resumed_log(outcomes, sources, settings)
@@ -151,7 +151,7 @@ def _resumed_log(
         "seed": settings.seed,
         "depth": settings.depth,
         "scenes": [*map(settings.scenes.key, settings.scenes.names)],
-        "look_ahead": settings.look_ahead,
+        "reachability": settings.reachability,
     }
     log.resume(decisive_settings, outcome_from_json)
     known = [outcome.name for outcome in log.outcomes]

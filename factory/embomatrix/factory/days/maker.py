@@ -74,7 +74,7 @@ class DayMaker:
         self._plan = plan
         self._proofs = None if proofs is None else DayProofs(proofs)
         self._library = PlacementLibrary()
-        self._foresight = ReachabilitySurvey() if settings.look_ahead else None
+        self._foresight = ReachabilitySurvey() if settings.reachability else None
         self._bases: dict[str, Scene] = dict(own)
 
     def make(self, order: VariantOrder) -> VariantYield:

@@ -48,7 +48,7 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
     conditions = {
         "dataset": folder.name,
         "scenes": len({base_scene_of(each["scene"]) for each in attempts}),
-        "look ahead": "yes" if settings.get("look_ahead") else "no",
+        "reachability": "yes" if settings.get("reachability") else "no",
         "in physics": "yes" if settings.get("physical") else "no",
     }
     return EvaluationFigures(

@@ -41,8 +41,8 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     "admission": (
         "Admission",
         "`embomatrix factory evaluate admission --dataset DATASET` reads the ledger of a build. *admitted_per_hour* is "
-        "computed from CPU time for two dedicated cores. The time covers writing, layout, look-ahead and verification of all "
-        "drafts, and the base scenes. *plain* is the writer without social simulation.",
+        "computed from CPU time for two dedicated cores. The time covers writing, layout, reachability analysis and "
+        "verification of all drafts, and the base scenes. *plain* is the writer without social simulation.",
     ),
     "skills": (
         "Needed skills",

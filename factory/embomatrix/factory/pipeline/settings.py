@@ -24,7 +24,7 @@ class BuildSettings:
     seed: int = 0
     scenes: tuple[str, ...] = DEFAULT_SCENES
     writer: WriterKind = WriterKind.PLAIN
-    look_ahead: bool = True
+    reachability: bool = True
     """Analyse the arm's reach in each variant: about 12 s of CPU per variant."""
     physical: bool = True
     """Require that a robot carries each plan out in stepped physics: about 1 s of CPU per task."""

@@ -96,7 +96,7 @@ class VariantMaker:
         self.settings = settings
         self.writer = writer
         self.library = PlacementLibrary()
-        self.foresight = ReachabilitySurvey() if settings.look_ahead else None
+        self.foresight = ReachabilitySurvey() if settings.reachability else None
         self._layout = layout
         self._bases: dict[str, Scene] = dict(own)
 

@@ -38,7 +38,7 @@ class ImportSettings:
     scenes: BaseScenes
     seed: int
     depth: Depth
-    look_ahead: bool
+    reachability: bool
 
 
 class ProblemImporter:
@@ -47,7 +47,7 @@ class ProblemImporter:
     def __init__(self, settings: ImportSettings) -> None:
         self._settings = settings
         self._bases = settings.scenes.built_all()
-        self._foresight = ReachabilitySurvey() if settings.look_ahead else None
+        self._foresight = ReachabilitySurvey() if settings.reachability else None
         self._library = PlacementLibrary()
 
     def run(self, source: SourceText) -> ImportOutcome:

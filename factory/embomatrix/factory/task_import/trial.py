@@ -1,4 +1,4 @@
-"""Trial of one problem in one base scene, in seconds: bound, verified without look-ahead, and explained check by check."""
+"""Trial of one problem in one base scene, in seconds: bound, verified without the arm's reach, and explained check by check."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum

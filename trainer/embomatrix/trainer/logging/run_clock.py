@@ -8,7 +8,9 @@ from enum import StrEnum
 from typing import Final
 
 GUESS_AFTER_S: Final = 5.0
-"""Seconds of a phase after which its own speed is used."""
+"""Seconds of a phase after which its own speed is used, if it also got far enough."""
+GUESS_AFTER_SHARE: Final = 0.05
+"""Share of a phase after which its own speed is used: its first steps are slow, because processes and scenes get warm."""
 
 
 class Phase(StrEnum):
@@ -37,7 +39,7 @@ class PhaseTime:
 
     @property
     def is_measured(self) -> bool:
-        return self.spent_s >= GUESS_AFTER_S and self.share > self.began_at
+        return self.spent_s >= GUESS_AFTER_S and self.share - self.began_at >= GUESS_AFTER_SHARE
 
     def left_s(self, slowness: float | None) -> float | None:
         """Return the seconds that the phase still takes, None if nothing is known about its speed.
