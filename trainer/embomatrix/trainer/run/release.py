@@ -67,12 +67,13 @@ def card_of(
         lines.append(
             f"| {(category or 'all').replace('_', ' ')} | {len(after)} | {_success(before)} | {_success(after)} |"
         )
+    value, low, high = (100 * share for share in (gain.value, gain.low, gain.high))
     lines += [
         "",
-        f"Difference: {gain.as_percent()}. One seed.",
+        f"Difference: {value:+.1f} points [{low:.1f}, {high:.1f}]. One seed.",
         "",
         "It reads instructions of the words that its training tasks use, and fails at most others. It knows no scene but those "
-        "of its prompt, and was never tested on a real robot. Licence: MIT, as the package.",
+        "of its prompt, and was never tried on a real robot. Licence: MIT, as the package.",
     ]
     return "\n".join(lines) + "\n"
 
