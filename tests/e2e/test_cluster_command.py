@@ -102,7 +102,8 @@ async def test_unknown_run_or_worker_error_names_the_remedy(tmp_path):
         assert (drain.status, "there is no worker 'w9'" in drain.text) == (2, True)
         assert (await cluster_command("workers", there)).text.startswith("no workers: start one")
         async with open_run(at.address):
-            written = await cluster_command("report", "r1", f"--out={tmp_path / 'no' / 'r.html'}", there)
+            (tmp_path / "file").touch()
+            written = await cluster_command("report", "r1", f"--out={tmp_path / 'file' / 'r.html'}", there)
         assert (written.status, "can't be written" in written.text) == (2, True)
 
 

@@ -15,6 +15,7 @@ from tests.integration.test_rest import http_at
 from embomatrix.manager.web.rewards import REWARDS, RUN_ID
 from embomatrix.rpc.reward_label import RewardLabel
 from embomatrix.rpc.wire.tokens import AccessRole
+from embomatrix.trainer.adapters.openrlhf import rows
 from embomatrix.world.task import Profile
 
 pytestmark = pytest.mark.timeout(60)
@@ -148,7 +149,7 @@ async def test_blocks_of_the_adapters_page_upload_scenes_and_name_the_route(tmp_
         text = upload.replace("HOST:50070", at.address).replace("build/dataset", str(dataset))
         names = {}
         await eval(compile(text, "docs/adapters.md", "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT), names)
-        row = names["rows"](dataset)[0]
+        row = rows(dataset)[0]
         label, prompt = row[given["--data.label_key"]], row[given["--data.input_key"]][1]["content"]
         answer = await http.post(route, json=asked("move 3", prompt=prompt, label=label))
     assert answer.status_code == 200, answer.text

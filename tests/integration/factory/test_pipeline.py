@@ -314,7 +314,7 @@ def test_list_selects_tasks_and_shows_them_in_pages(folder: Path, dataset: Datas
     assert code == 0
     assert dataset.records[1].task.task_id in output
     assert dataset.records[0].task.task_id not in output
-    assert "none of" in run("list", "--dataset", str(folder), "--search=no such words")[1]
+    assert "no task of" in run("list", "--dataset", str(folder), "--search=no such words")[1]
     assert run("list", "--dataset", str(folder), "--split=test")[0] == 2
 
 

@@ -147,7 +147,6 @@ def _experiment(preset: Preset, summary: str) -> Callable[..., None]:
             arms = checked_arms([parse_arm(text) for text in arm]) if arm else preset.arms
             if out is None or not arms:
                 raise TrainerError("an experiment needs a folder and arms: name them with --out and --arm")
-            prepare_output("experiment", out / SECTION_FILE)
             design = Design(
                 name=title,
                 dataset=f"`{dataset.name}` ({dataset_digest(dataset)})",

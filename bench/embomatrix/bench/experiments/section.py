@@ -73,6 +73,7 @@ def learning_section(
 def add_section(page: Path, section: str) -> None:
     """Append a section to a page; a missing page is created with its head. Raise OSError."""
     before = page.read_text(encoding="utf-8") if page.exists() else HEAD
+    page.parent.mkdir(parents=True, exist_ok=True)
     write_whole(page, f"{before.rstrip()}\n\n{section.rstrip()}\n".encode())
 
 
