@@ -226,10 +226,10 @@ def step_info(outcome: EpisodeStep) -> dict[str, Any]:
     }
 
 
-def _check_number(name: str, value: object, count: int | None) -> None:
+def _check_number(name: str, value: Any, count: int | None) -> None:
     """Raise ValueError for a value that isn't a whole number below ``count``, or a finite number if that is None."""
     try:
-        number = float(value)  # type: ignore[arg-type]  # any object: float() itself is the check
+        number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if count is None:
