@@ -272,6 +272,7 @@ async def test_every_page_shows_the_figures_of_the_api_while_rollouts_flow_and_a
         ended.set()
         await trainer
 
+        await _until_all_are_counted(http, cluster)
         calm = (await _agreed_on_every_page(opened, http))[-1]["overview"]
         assert calm["redispatched"] > 0, "the kill hit no rollout: the test shows nothing"
         assert (calm["outcomes"]["completed"], calm["failed"]) == (cluster.completed(), cluster.failed())
@@ -279,6 +280,14 @@ async def test_every_page_shows_the_figures_of_the_api_while_rollouts_flow_and_a
         await client.close_run(run_id)
         assert opened.wrong == []
         await _assert_reports_agree(opened, cluster, calm, tmp_path)
+
+
+async def _until_all_are_counted(http, cluster):
+    """Wait for a snapshot that was taken after the last result: viewers share one for 0.9 s, and batches take less."""
+    ends_s = time.monotonic() + 20
+    while (outcomes := (await http.get("overview")).json()["outcomes"])["completed"] < cluster.completed():
+        assert time.monotonic() < ends_s, f"{outcomes}, the trainer received {cluster.completed()} completed"
+        await asyncio.sleep(0.1)
 
 
 async def _assert_run_page_agrees(opened, http, run_id, calm):
