@@ -13,7 +13,7 @@ from typing import Final
 
 from embomatrix.starter.archive import packed_records, read_packed
 from embomatrix.starter.options import DATASET_VARIABLE, default_dataset
-from embomatrix.starter.recipes import PARTS
+from embomatrix.starter.recipes import PARTS, STARTER_PARTS
 from embomatrix.world.dataset import (
     TASKS_FILE,
     Dataset,
@@ -56,14 +56,14 @@ def unpack_part(folder: Path, part: int) -> None:
 
 
 def unpack(folder: Path) -> str:
-    """Write all shipped parts to a folder as one dataset and return the digest of their digests.
+    """Write the starter dataset to a folder and return the digest of its parts' digests.
 
     Raises DatasetError or OSError.
     """
     everything: list[TaskRecord] = []
     bundles: dict[str, bytes] = {}
     digests = []
-    for part in shipped_parts():
+    for part in STARTER_PARTS:
         records, contents, digest = read_packed(archive_of(part))
         everything += records
         bundles |= contents
@@ -72,22 +72,21 @@ def unpack(folder: Path) -> str:
     return f"sha256:{hashlib.sha256(' '.join(digests).encode('ascii')).hexdigest()}"
 
 
-def holds_shipped(folder: Path, parts: Iterable[int] | None = None) -> bool:
-    """Return True if a folder holds the records of these parts, by default of all. Bundles are not compared."""
+def holds_shipped(folder: Path, parts: Iterable[int] = STARTER_PARTS) -> bool:
+    """Return True if a folder holds the records of these shipped parts. Bundles are not compared."""
     try:
         dataset = Dataset.load(folder)
     except DatasetError:
         return False
-    numbers = shipped_parts() if parts is None else parts
-    shipped = [record for part in numbers for record in packed_records(archive_of(part))]
+    shipped = [record for part in parts for record in packed_records(archive_of(part))]
     found = json.loads(json.dumps([record_to_json(record) for record in dataset.records]))
     return [{**value, "bundle": 0} for value in found] == [{**value, "bundle": 0} for value in shipped]
 
 
 def dataset_folder(named: Path | None) -> Path:
-    """Return the folder of the dataset to use: the named one, $EMBOMATRIX_DATASET, build/dataset, or the shipped tasks.
+    """Return the folder of the dataset to use: the named one, $EMBOMATRIX_DATASET, build/dataset, or the starter dataset.
 
-    The last are unpacked at the first use. Raise DatasetError or OSError.
+    The last is unpacked at the first use. Raise DatasetError or OSError.
     """
     if named is not None:
         return named
@@ -123,12 +122,12 @@ def shipped_policy() -> Path:
 
 
 def unpacked_tasks() -> Path:
-    """Return the folder of the shipped tasks in the user's cache, and unpack them there if they are missing.
+    """Return the folder of the starter dataset in the user's cache, and unpack it there if it is missing.
 
     Raise DatasetError or OSError.
     """
     hashed = hashlib.sha256()
-    for part in shipped_parts():
+    for part in STARTER_PARTS:
         hashed.update(archive_of(part).read_bytes())
     folder = _cache() / f"tasks-{hashed.hexdigest()[:12]}"
     if not (folder / TASKS_FILE).exists():

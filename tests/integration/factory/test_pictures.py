@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from embomatrix.factory.commands.scenes import app
 from embomatrix.factory.pictures.scene import FILL, draw_plan
 from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
+from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.sim.bullet.camera import (
     box_of,
     furnish_cutaway,
@@ -47,6 +48,20 @@ def test_oblique_view_holds_the_whole_scene(flat: Scene) -> None:
     assert 0.15 < background.mean() < 0.85
     edge = np.concatenate([background[0], background[-1], background[:, 0], background[:, -1]])
     assert edge.mean() > 0.95, "nothing is cut off at the edge of the picture"
+
+
+def test_pictures_on_low_walls_are_left_out_and_what_stands_on_shelves_stays() -> None:
+    scene = build_base_scene("Ihlen_1_int", seed=0)
+    pictures = {item.name for item in scene.objects if scene.assets[item.asset_id].category == "picture"}
+    with VisualScene(scene) as stage:
+        furnish_cutaway(stage)
+        shown = set(stage.owners.values())
+    assert pictures - shown, "pictures hang on near walls: their walls are cut below them"
+    assert pictures & shown, "pictures hang on far walls"
+    assert {item.name for item in scene.objects if item.host} <= shown
+    with VisualScene(scene) as stage:
+        furnish_whole(stage)
+        assert pictures <= set(stage.owners.values())
 
 
 def test_plan_shows_its_windows(flat: Scene) -> None:

@@ -1,13 +1,22 @@
 """Choice of the dataset that a command uses, unpacking of the shipped tasks, and what ships."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from embomatrix.starter import shipped
+from embomatrix.starter.archive import read_packed
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
-from embomatrix.starter.recipes import PARTS
-from embomatrix.starter.shipped import frozen_tasks, holds_shipped, shipped_parts, unpack, verified_file
+from embomatrix.starter.recipes import PARTS, STARTER_PARTS
+from embomatrix.starter.shipped import (
+    archive_of,
+    frozen_tasks,
+    holds_shipped,
+    shipped_parts,
+    unpack,
+    verified_file,
+)
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
 from embomatrix.world.difficulty import DifficultyLevel
@@ -63,8 +72,8 @@ def tasks(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset.load(folder)
 
 
-def test_shipped_parts_have_the_tasks_of_their_recipes_in_scenes_of_their_own(tasks: Dataset) -> None:
-    recipes = [PARTS[part] for part in shipped_parts()]
+def test_starter_dataset_has_held_out_tasks_in_scenes_of_their_own(tasks: Dataset) -> None:
+    recipes = [PARTS[part] for part in STARTER_PARTS]
     assert len(tasks.train) == sum(recipe.train for recipe in recipes)
     assert len(tasks.heldout) == sum(recipe.heldout for recipe in recipes)
     scenes = {
@@ -74,9 +83,19 @@ def test_shipped_parts_have_the_tasks_of_their_recipes_in_scenes_of_their_own(ta
     assert not scenes["train"] & scenes["heldout"]
     assert len(scenes["train"]) >= 10
     assert len({record.task.task_id for record in tasks.records}) == len(tasks.records)
-    assert all(record.difficulty is not None for record in tasks.records)
     for record in tasks.records[::10]:
         assert record.task.task_id in tasks.read_bundle(record.bundle_digest).tasks
+
+
+def test_shipped_parts_have_the_tasks_of_their_recipes_each_with_its_difficulty() -> None:
+    assert set(STARTER_PARTS) <= set(shipped_parts())
+    for part in shipped_parts():
+        recipe, (records, *_) = PARTS[part], read_packed(archive_of(part))
+        counts = Counter(record.split for record in records)
+        assert counts == +Counter(train=recipe.train, heldout=recipe.heldout), f"part {part}"
+        assert {record.task.scene_id.partition("-")[0] for record in records} <= set(recipe.scenes)
+        assert len({record.task.task_id for record in records}) == len(records)
+        assert all(record.difficulty is not None for record in records)
 
 
 def test_recipes_make_2000_training_and_200_held_out_tasks_in_all_scenes() -> None:

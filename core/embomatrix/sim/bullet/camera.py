@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -22,6 +23,10 @@ CUT_M: Final = 0.45
 """Walls between the camera and the rooms are shown up to this height."""
 CEILING_M: Final = 2.3
 """Objects that hang this high are left out: they would hide the rooms."""
+FLAT_M: Final = 0.15
+"""Things on walls that stand out less are flat: pictures, mirrors, clocks, switches."""
+WALL_GAP_M: Final = 0.1
+"""Largest distance from a wall to what hangs on it."""
 _SHOWN_M: Final = 3.6
 """Walls of higher rooms are shown up to this height in oblique pictures."""
 ELEVATION: Final = math.radians(52.0)
@@ -81,11 +86,20 @@ def photograph_around(
 
 
 def furnish_cutaway(stage: VisualScene) -> None:
-    """Fill a stage for oblique pictures: no ceiling objects, near walls cut low."""
+    """Fill a stage for oblique pictures: no ceiling objects, near walls cut low and without the pictures on them."""
+    scene = stage.scene
+    low_walls = [wall.aabb(IDENTITY) for wall in scene.walls if _hides(scene, wall)]
     stage.add_floors()
-    stage.add_walls(lambda wall: _cut(stage.scene, wall))
-    stage.add_objects(lambda item: not _hangs_at_ceiling(stage.scene, item))
-    stage.add_background()
+    stage.add_walls(lambda wall: _cut(scene, wall))
+    stage.add_objects(
+        lambda item: (
+            not (
+                _hangs_at_ceiling(scene, item)
+                or (item.fixed and not item.host and _would_float(scene.box_of(item.name), low_walls))
+            )
+        )
+    )
+    stage.add_background(lambda item, box: bool(item.host) or not _would_float(box, low_walls))
 
 
 def furnish_whole(stage: VisualScene) -> None:
@@ -155,6 +169,14 @@ def _hangs_at_ceiling(scene: Scene, item: SceneObject) -> bool:
     height = scene.assets[item.asset_id].size_m[2]
     middle = item.pose_world_asset.position_m[2]
     return middle + height / 2 > CEILING_M and (height < 1.8 or middle > CEILING_M)
+
+
+def _would_float(box: Aabb, low_walls: Sequence[Aabb]) -> bool:
+    """Return True for the box of a flat thing that hangs on a wall cut below it, such as a picture."""
+    return box.low_m[2] > CUT_M and any(
+        wall.overlaps(box, WALL_GAP_M) and box.size_m[int(np.argmin(wall.size_m[:2]))] < FLAT_M
+        for wall in low_walls
+    )
 
 
 def _cut(scene: Scene, wall: ConvexPart) -> ConvexPart | None:

@@ -23,8 +23,8 @@ from embomatrix.sim.looks.parts import part_materials
 from embomatrix.sim.looks.rooms import CEILING, DOOR_PANEL, PANE, WALL, floor_of
 from embomatrix.sim.looks.surfaces import THINNEST_M
 from embomatrix.sim.looks.view import View
-from embomatrix.world.geometry import IDENTITY, ConvexPart, Pose, Shape, Vec3
-from embomatrix.world.scene import Scene, SceneObject
+from embomatrix.world.geometry import IDENTITY, Aabb, ConvexPart, Pose, Shape, Vec3
+from embomatrix.world.scene import BackgroundObject, Scene, SceneObject
 
 FloatArray = NDArray[np.float64]
 
@@ -124,9 +124,13 @@ class VisualScene:
             if not item.absent:
                 self.put(item.name, item.pose_world_asset, item.joints)
 
-    def add_background(self) -> None:
-        """Add the background objects at their places."""
-        for item in self.scene.background:
+    def add_background(
+        self, visible: Callable[[BackgroundObject, Aabb], bool] = lambda item, box: True
+    ) -> None:
+        """Add the background objects at their places. ``visible`` is asked with each one's world box."""
+        for item, box in zip(self.scene.background, self.scene.background_boxes, strict=True):
+            if not visible(item, box):
+                continue
             asset = self.scene.assets[item.asset_id]
             materials = iter(part_materials(asset))
             for link in asset.links:

@@ -1,4 +1,4 @@
-"""``embomatrix factory starter``: unpack the dataset that ships with the package."""
+"""``embomatrix factory starter``: unpack the starter dataset, parts 1 and 2 of the corpus."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ def starter(
     out: Annotated[Path, typer.Option(help="Folder for the dataset.")] = Path("build/dataset"),
     force: Force = False,
 ) -> None:
-    """Unpack the dataset that ships with the package."""
+    """Unpack the starter dataset that ships with the package."""
     with user_errors(out):
         if not force:
             _check_replaceable(out)
@@ -25,8 +25,9 @@ def starter(
 
 
 def _check_replaceable(out: Path) -> None:
-    """Exit if the folder holds a dataset other than the shipped one."""
+    """Exit if the folder holds a dataset other than the starter dataset."""
     if (out / TASKS_FILE).exists() and not holds_shipped(out):
         fail(
-            f"{out} holds another dataset than the shipped one: name another folder with --out, or pass --force to replace it"
+            f"{out} holds another dataset than the starter dataset: name another folder with --out, or pass --force to "
+            "replace it"
         )
