@@ -14,7 +14,7 @@ from embomatrix.skills.syntax import PROFILES
 from embomatrix.trainer.cluster.gateway import parse_policy_text
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
-from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.decoder import DecoderShape, Shortlist
 from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import END, UNKNOWN, build_vocabulary
@@ -52,6 +52,40 @@ def test_sampler_and_update_agree_on_log_probabilities():
     assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=1e-5)
     assert (scored.entropy[samples.mask] >= 0).all()  # 0 where one word alone may follow
     assert (scored.entropy[samples.mask] > 0).any()
+
+
+@pytest.mark.parametrize("in_grammar", [True, False])
+def test_words_that_no_plan_of_the_batch_contains_change_no_value(in_grammar, monkeypatch):
+    made = policy()
+    prompt_ids = prompts(made)
+    samples = draw(made, prompt_ids)
+    tokens = samples.tokens.clone()
+    if not in_grammar:  # plans of other sources contain words that no prompt names
+        tokens[samples.mask] = torch.arange(int(samples.mask.sum())) % len(WORDS)
+
+    def scored():
+        made.module.zero_grad()
+        found = made.logprobs(prompt_ids, tokens, samples.mask, 4, 1.3)
+        found.logprobs.sum().backward()
+        return found, [parameter.grad.clone() for parameter in made.parameters()]
+
+    included_words = []
+    shortlisted, gradients = scored()
+    monkeypatch.setattr(
+        Shortlist, "of", lambda included: included_words.append(int(included.sum())) or every_word(included)
+    )
+    whole, expected = scored()
+    assert not in_grammar or included_words[0] < len(WORDS)
+    assert torch.allclose(shortlisted.logprobs, whole.logprobs, atol=1e-5)
+    assert torch.allclose(shortlisted.entropy, whole.entropy, atol=1e-5)
+    for one, other in zip(gradients, expected, strict=True):
+        assert torch.allclose(one, other, atol=1e-4 * float(other.abs().max()) + 1e-7)
+    assert torch.equal(draw(made, prompt_ids).tokens, samples.tokens)
+
+
+def every_word(included):
+    numbers = torch.arange(len(included))
+    return Shortlist(numbers, numbers)
 
 
 def test_entropy_has_a_graph_only_on_request():

@@ -7,7 +7,7 @@ the probability goes to words of the prompt and of the plan so far by attention 
 eq. 9). Copying an object name is then an attention lookup, for rare and frequent words alike.
 
 Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, S plan tokens so far, H heads of width D, C = H * D,
-V words.
+V words, K of them on a shortlist.
 """
 
 from __future__ import annotations
@@ -54,6 +54,25 @@ def check_weights(shape: DecoderShape, weights: Mapping[str, Tensor]) -> None:
         raise ValueError(
             f"the weights have the shape {found}: expected {shape}, with heads that divide its width"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Shortlist:
+    """Words that plans of a batch can contain, a small part of the vocabulary (Jean et al. 2015). Only they get scores.
+
+    ``words`` (K,), ascending; ``columns`` (V,), each word's place among them, -1 for all others.
+    """
+
+    words: Tensor
+    columns: Tensor
+
+    @staticmethod
+    def of(included: Tensor) -> Shortlist:
+        """Return the words that a mask (V,) includes."""
+        words = included.nonzero()[:, 0]
+        columns = torch.full_like(included, -1, dtype=torch.long)
+        columns[words] = torch.arange(len(words), device=words.device)
+        return Shortlist(words, columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,25 +194,36 @@ class Decoder(nn.Module):
         nn.init.zeros_(self.pointer_gate.bias)
 
     def scores(
-        self, states: Tensor, prompt: PromptCache, plan: PlanCache | None, token_mask: Tensor
+        self,
+        states: Tensor,
+        prompt: PromptCache,
+        plan: PlanCache | None,
+        shortlist: Shortlist,
+        token_mask: Tensor,
     ) -> Tensor:
-        """Log scores (Q * G, T, V) of the next words for hidden states (Q * G, T, C).
+        """Log scores (Q * G, T, K) of the shortlist as next words for hidden states (Q * G, T, C).
 
         The hidden states are the last T of those after the prompt and after each word of ``plan``. ``token_mask``
-        (Q * G, T, V) is true on words to exclude.
+        (Q * G, T, K) is true on words to exclude.
         """
         x = self.norm(states)
-        generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(token_mask, _MASKED), dim=-1)
-        attention, words = self._point(x, prompt, plan, token_mask)
-        pointed = torch.zeros_like(generated).scatter_add(2, words, attention)
+        weight = self.embedding.weight[shortlist.words]
+        generated = torch.softmax((x @ weight.t()).masked_fill(token_mask, _MASKED), dim=-1)
+        attention, columns = self._point(x, prompt, plan, shortlist, token_mask)
+        pointed = torch.zeros_like(generated).scatter_add(2, columns, attention)
         gate = torch.sigmoid(self.pointer_gate(x))  # (Q G, T, 1)
         mixed = torch.lerp(generated, pointed, gate)
         return mixed.clamp(min=_MIN_PROBABILITY).log().masked_fill(token_mask, _MASKED)
 
     def _point(
-        self, x: Tensor, prompt: PromptCache, plan: PlanCache | None, token_mask: Tensor
+        self,
+        x: Tensor,
+        prompt: PromptCache,
+        plan: PlanCache | None,
+        shortlist: Shortlist,
+        token_mask: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Pointer attention of normalised states: probabilities of positions, prompt first, and their words.
+        """Pointer attention of normalised states: probabilities of positions, prompt first, and their words' columns.
 
         Both have shape (Q * G, T, P + S). All probabilities are 0 if every word is masked.
         """
@@ -202,18 +232,22 @@ class Decoder(nn.Module):
         query = self.pointer_query(x) * width**-0.5  # (Q G, T, C)
         logits = (query.view(prompts, -1, width) @ prompt.pointer_keys.transpose(1, 2)).view(rows, length, -1)
         group = rows // prompts
-        words = prompt.tokens.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
-        padding = prompt.padding.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
+        columns = shortlist.columns[prompt.tokens]  # (Q, P)
+        absent = prompt.padding | (columns < 0)
+        columns = columns.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
+        absent = absent.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
         if plan:
             count = plan.tokens.shape[1]
             future = torch.ones(length, count, dtype=torch.bool, device=x.device).triu(count - length + 1)
             logits = torch.cat([logits, query @ plan.pointer_keys.transpose(1, 2)], dim=2)
-            words = torch.cat([words, plan.tokens[:, None].expand(rows, length, count)], dim=2)
-            padding = torch.cat([padding, future.expand(rows, length, count)], dim=2)
-        excluded = padding | token_mask.gather(2, words)
+            own = shortlist.columns[plan.tokens]  # (Q G, S): all of its words are on the shortlist
+            columns = torch.cat([columns, own[:, None].expand(rows, length, count)], dim=2)
+            absent = torch.cat([absent, future.expand(rows, length, count)], dim=2)
+        columns = columns.clamp(min=0)
+        excluded = absent | token_mask.gather(2, columns)
         # If no position is left: zeros, not a uniform distribution. The softmax over the scores renormalises.
         attention = torch.softmax(logits.masked_fill(excluded, _MASKED), dim=-1)
-        return attention.masked_fill(excluded, 0.0), words
+        return attention.masked_fill(excluded, 0.0), columns
 
     def _rope(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Cosines and sines for positions (rows, T)."""
@@ -282,18 +316,19 @@ def _attend(
     rows, heads, length, depth = q.shape
     prompts, _, prompt_length, _ = prompt_cache.keys.shape
     group = rows // prompts
-    query = (q * depth**-0.5).view(prompts, group, heads, length, depth).transpose(1, 2)  # (Q, H, G, T, D)
-    flat = query.reshape(prompts, heads, group * length, depth)
+    query = q * depth**-0.5
+    grouped = query.view(prompts, group, heads, length, depth).transpose(1, 2)  # (Q, H, G, T, D)
+    flat = grouped.reshape(prompts, heads, group * length, depth)
     to_prompt = (flat @ prompt_cache.keys.transpose(-1, -2)).view(
         prompts, heads, group, length, prompt_length
     ) + bias
-    own_keys = keys.view(prompts, group, heads, -1, depth).transpose(1, 2)  # (Q, H, G, S, D)
-    own_values = values.view(prompts, group, heads, -1, depth).transpose(1, 2)
-    to_own = query @ own_keys.transpose(-1, -2)  # (Q, H, G, T, S)
+    # The sample's own keys and values stay in place: weights are reordered instead, which are D times smaller.
+    to_own = query @ keys.transpose(-1, -2)  # (Q G, H, T, S)
     if length > 1:
         to_own = to_own.masked_fill(future, _MASKED)
+    to_own = to_own.view(prompts, group, heads, length, -1).transpose(1, 2)  # (Q, H, G, T, S)
     weights = torch.softmax(torch.cat([to_prompt, to_own], dim=-1), dim=-1)
     over_prompt = weights[..., :prompt_length].reshape(prompts, heads, group * length, prompt_length)
-    result = (over_prompt @ prompt_cache.values).view(prompts, heads, group, length, depth)
-    result = result + weights[..., prompt_length:] @ own_values
-    return result.transpose(1, 2).reshape(rows, heads, length, depth)
+    from_prompt = (over_prompt @ prompt_cache.values).view(prompts, heads, group, length, depth)
+    over_own = weights[..., prompt_length:].transpose(1, 2).reshape(rows, heads, length, -1)
+    return from_prompt.transpose(1, 2).reshape(rows, heads, length, depth) + over_own @ values

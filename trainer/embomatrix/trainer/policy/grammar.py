@@ -118,6 +118,13 @@ class PlanGrammar:
             numbers[row[follows >= 0], word[follows >= 0], follows[follows >= 0]] = True
         return PromptNames(stems, unnumbered, numbers)
 
+    def words(self, names: PromptNames) -> Tensor:
+        """Return the mask (V,) of the words that plans for these prompts can contain."""
+        found = self._fixed.any(dim=0) | names.stems.any(dim=1).any(dim=0)
+        found[self._numbers] |= names.numbers.any(dim=1).any(dim=0)
+        found[[PAD, END]] = True
+        return found
+
     def start(self, rows: int) -> GrammarState:
         """State of empty plans."""
         nothing = torch.full((rows,), PAD, device=self._number_index.device)
@@ -152,14 +159,15 @@ class PlanGrammar:
         allowed[:, END] |= ~allowed.any(dim=1)
         return ~allowed
 
-    def token_masks(self, tokens: Tensor, names: PromptNames) -> Tensor:
-        """Return the masked words (R, T, V) at each position of plans (R, T).
+    def token_masks(self, tokens: Tensor, names: PromptNames, words: Tensor) -> Tensor:
+        """Return which of ``words`` (K,) are masked at each position of plans (R, T): (R, T, K).
 
         The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood.
         """
         state = self.start(len(tokens))
         masks = []
         for at in range(tokens.shape[1]):
-            masks.append(self.token_mask(state, names))
+            mask = self.token_mask(state, names)
+            masks.append(mask.scatter_(1, tokens[:, at, None], False)[:, words])
             state = self.advance(state, tokens[:, at])
-        return torch.stack(masks, dim=1).scatter(2, tokens[:, :, None], False)
+        return torch.stack(masks, dim=1)

@@ -15,7 +15,14 @@ from torch.nn import functional
 
 from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.policy.compute_dtype import frozen_weights
-from embomatrix.trainer.policy.decoder import Decoder, DecoderShape, PlanCache, PromptCache, check_weights
+from embomatrix.trainer.policy.decoder import (
+    Decoder,
+    DecoderShape,
+    PlanCache,
+    PromptCache,
+    Shortlist,
+    check_weights,
+)
 from embomatrix.trainer.policy.grammar import GrammarState, PlanGrammar, PromptNames
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left, token_entropy
 from embomatrix.trainer.policy.tensor_file import read_tensors
@@ -41,6 +48,7 @@ class _SamplingState:
     rows: Tensor
     active: Tensor
     prompts: PromptCache
+    shortlist: Shortlist
     names: PromptNames
     grammar_state: GrammarState
     plan: PlanCache | None
@@ -69,6 +77,7 @@ class _SamplingState:
             self.rows[kept],
             self.active[kept],
             self.prompts if len(prompts) == len(self.prompts.lengths) else self.prompts.select(prompts),
+            self.shortlist,
             self.names.select(kept),
             self.grammar_state.select(kept),
             self.plan.select(kept) if self.plan else None,
@@ -132,9 +141,11 @@ class TinyPolicy:
         length = 0
         with frozen_weights(self.module):
             for at in range(max_new):
-                token_mask = self._grammar.token_mask(state.grammar_state, state.names)[:, None]
-                scores = self.module.scores(hidden, state.prompts, state.plan, token_mask)[:, 0]
-                choice, logprob = draw(scores, temperature, generator)
+                words = state.shortlist.words
+                token_mask = self._grammar.token_mask(state.grammar_state, state.names)[:, None, words]
+                scores = self.module.scores(hidden, state.prompts, state.plan, state.shortlist, token_mask)
+                column, logprob = draw(scores[:, 0], temperature, generator)
+                choice = words[column]
                 rows, active = state.rows, state.active
                 tokens[rows, at] = torch.where(active, choice, PAD)
                 logprobs[rows, at] = torch.where(active, logprob, 0.0)
@@ -156,9 +167,12 @@ class TinyPolicy:
         """Start ``group`` empty plans per prompt."""
         cache = self.module.encode_prompts(*pad_left(prompts, PAD, self.device))
         rows = torch.arange(len(prompts) * group, device=self.device)
-        names = self._grammar.prompt_names(cache.tokens).select(rows // group)
+        names = self._grammar.prompt_names(cache.tokens)
+        shortlist = Shortlist.of(self._grammar.words(names))
         active = torch.ones(len(rows), dtype=torch.bool, device=self.device)
-        return _SamplingState(rows, active, cache, names, self._grammar.start(len(rows)), None)
+        return _SamplingState(
+            rows, active, cache, shortlist, names.select(rows // group), self._grammar.start(len(rows)), None
+        )
 
     def logprobs(
         self,
@@ -172,8 +186,11 @@ class TinyPolicy:
     ) -> TokenScores:
         cache = self.module.encode_prompts(*pad_left(prompts, PAD, self.device))
         prompt_of_row = torch.arange(len(tokens), device=self.device) // group
-        names = self._grammar.prompt_names(cache.tokens).select(prompt_of_row)
-        token_masks = self._grammar.token_masks(tokens, names)  # (rows, T, V)
+        names = self._grammar.prompt_names(cache.tokens)
+        included = self._grammar.words(names)
+        included[tokens] = True  # other sources' plans may break the grammar
+        shortlist = Shortlist.of(included)
+        token_masks = self._grammar.token_masks(tokens, names.select(prompt_of_row), shortlist.words)
         lengths = mask.sum(dim=1)
         order = torch.argsort(lengths, stable=True)
         scores = []
@@ -182,7 +199,12 @@ class TinyPolicy:
             bucket = cache.select(prompt_of_row[rows])
             scores.append(
                 self._score(
-                    bucket, tokens[rows, :length], token_masks[rows, :length], temperature, entropy_gradient
+                    bucket,
+                    tokens[rows, :length],
+                    shortlist,
+                    token_masks[rows, :length],
+                    temperature,
+                    entropy_gradient,
                 )
             )
         restore_order = torch.argsort(order)
@@ -197,19 +219,20 @@ class TinyPolicy:
         self,
         prompts: PromptCache,
         tokens: Tensor,
+        shortlist: Shortlist,
         token_masks: Tensor,
         temperature: float,
         entropy_gradient: bool,
     ) -> tuple[Tensor, Tensor]:
-        """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks: (rows, T, V)."""
+        """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks: (rows, T, K)."""
         hidden, plan = prompts.last, None  # (rows, 1, C)
         if tokens.shape[1] > 1:
             rest, plan = self.module.extend(prompts, tokens[:, :-1], None)
             hidden = torch.cat([hidden, rest], dim=1)  # (rows, T, C)
         scores = torch.log_softmax(
-            self.module.scores(hidden, prompts, plan, token_masks) / (temperature or 1.0), dim=-1
-        )  # (rows, T, V)
-        chosen = scores.gather(-1, tokens[..., None])[..., 0]
+            self.module.scores(hidden, prompts, plan, shortlist, token_masks) / (temperature or 1.0), dim=-1
+        )  # (rows, T, K)
+        chosen = scores.gather(-1, shortlist.columns[tokens][..., None])[..., 0]
         return chosen, token_entropy(scores, gradient=entropy_gradient, minimum=_MIN_LOGPROB)
 
     def frozen_copy(self) -> TinyPolicy:
