@@ -108,6 +108,8 @@ _TEXTS = {
     "unfinished.toml": "speed =\n",
     "long_plans.toml": "[grpo]\nmax_new = 2000\n",
     "rate.toml": '[grpo]\nlearning_rate = "fast"\n',
+    "minibatches.toml": "[grpo]\ntasks_per_step = 4\nminibatches = 8\n",
+    "truncate.toml": "[grpo]\ntruncate_ratio = 2.0\n",
     "samples.toml": "samples = 0\n",
     "attic.toml": "cache_mbb = 3\n",
     "still.toml": "heartbeat_s = 0\n",
@@ -618,6 +620,18 @@ COMMANDS = (
         "train --settings=FILES/rate.toml --dataset=KITCHEN --out=FILES/new",
         "grpo.learning_rate",
         "should be a valid number",
+    ),
+    CommandCase(
+        "more minibatches than tasks",
+        "train --settings=FILES/minibatches.toml --dataset=KITCHEN --out=FILES/new",
+        "expected at most 4, the value of grpo.tasks_per_step",
+        "lower it, or raise grpo.tasks_per_step",
+    ),
+    CommandCase(
+        "truncated importance sampling on fresh plans",
+        "train --settings=FILES/truncate.toml --dataset=KITCHEN --out=FILES/new",
+        "expected grpo.overlap = 'ahead'",
+        "leave it out, or change grpo.overlap",
     ),
     CommandCase(
         "missing settings file",

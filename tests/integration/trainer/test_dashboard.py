@@ -53,7 +53,7 @@ def test_report_shows_best_and_worst_plan_and_a_lost_one_last():
     sent = []
     good, bad = outcomes(SymbolicCluster(TASKS), "toggle_on countertop", "what?")
     lost = good.__class__("move table", None)
-    group = GroupLog(ORACLE_TASK, (bad, lost, good), (-1.0, math.nan, 1.0), zero_variance=False)
+    group = GroupLog(ORACLE_TASK, (bad, lost, good), (-1.0, math.nan, 1.0), zero_variance=False, cut_off=0)
     DashboardReporter(sent.append).sampled(4, [group])
     (report,) = sent
     assert (report.step, report.figures) == (4, {})

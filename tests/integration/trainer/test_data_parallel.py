@@ -8,7 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster
-from tests.integration.trainer.test_loop import TASKS, run, weights
+from tests.integration.trainer.test_loop import SEVERAL_UPDATES, TASKS, run, weights
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
@@ -42,8 +42,14 @@ def learnt(folder, **changes):
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"grpo__chunk": 1}, {"grpo__chunk": 1, "grpo__reserve": 4, "grpo__overlap": "ahead"}],
-    ids=["plain", "several microbatches each", "all"],
+    [
+        {},
+        {"grpo__chunk": 1},
+        {"grpo__chunk": 1, "grpo__reserve": 4, "grpo__overlap": "ahead"},
+        {"grpo__chunk": 1, "grpo__updates_per_batch": 2},
+        {**SEVERAL_UPDATES, "grpo__reserve": 4, "grpo__overlap": "ahead", "grpo__truncate_ratio": 2.0},
+    ],
+    ids=["plain", "several microbatches each", "all", "two updates", "two updates of two minibatches"],
 )
 def test_two_processes_are_bit_identical_to_one(tmp_path, remotes, changes):
     one = learnt(tmp_path / "one", **changes)

@@ -83,6 +83,13 @@ def test_shared_prompt_gives_the_log_probabilities_of_a_plain_forward_pass(polic
         assert torch.allclose(shared.logprobs[row], plain * samples.mask[row], atol=1e-4)
 
 
+def test_samples_without_an_end_token_are_cut_off(policy):
+    samples = policy.sample(prompts(policy), 8, 1.0, 40, torch.Generator().manual_seed(0))
+    for tokens, mask, cut_off in zip(samples.tokens, samples.mask, samples.cut_off.tolist(), strict=True):
+        assert cut_off == (int(tokens[mask][-1]) not in policy._end)
+    assert 0 < samples.cut_off.sum() < len(samples.cut_off)
+
+
 def test_shared_prompt_gives_the_same_gradient(policy):
     prompt_ids = prompts(policy, 1)
     samples = policy.sample(prompt_ids, 2, 1.0, 8, torch.Generator().manual_seed(0))

@@ -42,6 +42,7 @@ SHORT = {
     "checkpoint_every": 3,
     "samples_every": 1,
 }
+SEVERAL_UPDATES = {"grpo__chunk": 1, "grpo__updates_per_batch": 2, "grpo__minibatches": 2}
 TASKS = make_tasks(10, 4, objects=10)
 SAMPLING, WAITING, UPDATE = Activity.SAMPLING, Activity.WAITING, Activity.UPDATE
 
@@ -75,9 +76,10 @@ def without_time(metrics):
     ]
 
 
-def test_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_path):
-    _, whole = run(tmp_path / "whole")
-    run(tmp_path / "halves")
+@pytest.mark.parametrize("changes", [{}, SEVERAL_UPDATES], ids=["one update", "several updates"])
+def test_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_path, changes):
+    _, whole = run(tmp_path / "whole", **changes)
+    run(tmp_path / "halves", **changes)
     newest = CheckpointStore(tmp_path / "halves" / CHECKPOINTS, keep=9).latest()
     for path in sorted(newest.rglob("*"), reverse=True):  # as if the run had been killed after its third step
         path.unlink() if path.is_file() else path.rmdir()
@@ -217,24 +219,43 @@ def test_interrupted_step_is_rolled_back_and_repeated_after_a_resume(tmp_path):
     assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "broken"))
 
 
-def test_ctrl_c_during_an_update_waits_for_the_end_of_the_step(tmp_path, monkeypatch):
+@pytest.mark.parametrize("changes", [{}, SEVERAL_UPDATES], ids=["one update", "several updates"])
+def test_ctrl_c_during_an_update_waits_for_the_end_of_the_step(tmp_path, monkeypatch, changes):
     apply = Updater._apply
 
     def interrupted(updater, state):
-        moved = apply(updater, state)
-        if state.plan.step == 4:
+        apply(updater, state)
+        if state.plan.step == 4 and len(state.norms) == 1:
             signal.raise_signal(signal.SIGINT)
-        return moved
 
-    _, whole = run(tmp_path / "whole")
+    _, whole = run(tmp_path / "whole", **changes)
     monkeypatch.setattr(Updater, "_apply", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "halves")
+        run(tmp_path / "halves", **changes)
     progress, _ = read_state(CheckpointStore(tmp_path / "halves" / CHECKPOINTS, keep=9).latest())
     assert progress.step == 4
     _, resumed = run(tmp_path / "halves", resume=True)
     assert torch.equal(weights(whole), weights(resumed))
     assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "halves"))
+
+
+def test_error_between_two_updates_of_a_step_leaves_the_checkpoint_before_the_step(tmp_path, monkeypatch):
+    apply = Updater._apply
+
+    def failing(updater, state):
+        apply(updater, state)
+        if state.plan.step == 5 and len(state.norms) == 2:
+            raise TrainerError("the process trainer-1 ended during a step")
+
+    _, whole = run(tmp_path / "whole", **SEVERAL_UPDATES)
+    with monkeypatch.context() as patched:
+        patched.setattr(Updater, "_apply", failing)
+        with pytest.raises(TrainerError, match="trainer-1 ended"):
+            run(tmp_path / "cut", **SEVERAL_UPDATES)
+    assert CheckpointStore(tmp_path / "cut" / CHECKPOINTS, keep=9).latest().name == "step-000003"
+    _, resumed = run(tmp_path / "cut", resume=True)
+    assert torch.equal(weights(whole), weights(resumed))
+    assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "cut"))
 
 
 def test_live_display_shows_every_phase(tmp_path):

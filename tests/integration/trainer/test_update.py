@@ -35,6 +35,18 @@ def test_step_ahead_is_sampled_from_weights_one_step_old(tmp_path):
     assert max(row["kl_to_old"] for row in rows[1:]) > 1e-6
 
 
+def test_truncated_importance_sampling_changes_updates_on_old_plans_only(tmp_path):
+    changes = {"grpo__overlap": Overlap.AHEAD, "grpo__learning_rate": 3e-2}
+    _, plain = trained(tmp_path / "plain", **changes)
+    _, truncated = trained(tmp_path / "truncated", grpo__truncate_ratio=1.0, **changes)
+    rows, others = read_metrics(tmp_path / "truncated"), read_metrics(tmp_path / "plain")
+    assert rows[0]["gradient_norm"] == others[0]["gradient_norm"]
+    assert max(row["kl_to_old"] for row in rows[1:]) > 1e-6
+    assert max(row["clipped"] for row in others[1:]) > 0
+    assert [row["clipped"] for row in rows] == [0.0] * 4
+    assert not torch.equal(weights(plain), weights(truncated))
+
+
 def test_zero_variance_groups_are_replaced_from_the_reserve(tmp_path):
     cluster = SymbolicCluster(TASKS)
     trained(tmp_path / "a", cluster=cluster, grpo__reserve=6, imitation__steps=0)

@@ -24,6 +24,7 @@ GROUPS = st.integers(2, 8).flatmap(
 
 NEW = [[-1.0, -0.5], [-2.0, -1.0], [-0.3, -0.7], [-1.2, -0.1]]
 OLD = [[-1.1, -0.9], [-1.5, -1.0], [-0.3, -0.2], [-1.2, -0.6]]
+SAMPLER = [[-1.9, -0.4], [-1.5, -1.3], [-0.6, -0.2], [-3.0, -0.5]]
 REFERENCE = [[-1.0, -0.6], [-1.8, -1.1], [-0.5, -0.7], [-1.0, -0.4]]
 MASK = [[True, True], [True, False], [True, True], [True, True]]
 ADVANTAGES = [1.0, -1.0, 0.5, -0.5]
@@ -48,21 +49,26 @@ LONGEST = 5
 TOTALS = LossTotals(4, 7, LONGEST)
 
 
-def by_hand(kind, ratio, low, high, kl_coef):
-    """Compute the objective in plain Python, plan by plan and token by token."""
+def ratios(new, old, own, level):
+    """Return the importance ratio at each of a plan's own tokens."""
+    gaps = [new[at] - old[at] for at in own]
+    if level is RatioLevel.TOKEN:
+        return [math.exp(gap) for gap in gaps]
+    return [math.exp(sum(gaps) / (len(gaps) if level is RatioLevel.MEAN else 1))] * len(gaps)
+
+
+def by_hand(kind, ratio, low, high, kl_coef, cap=None):
+    """Compute the objective in plain Python, plan by plan and token by token. ``cap`` truncates the sampler's weights."""
     plans = []
-    for new, old, reference, mask, advantage in zip(NEW, OLD, REFERENCE, MASK, ADVANTAGES, strict=True):
+    level = RatioLevel.MEAN if kind is LossKind.GSPO else ratio
+    rows = zip(NEW, OLD, SAMPLER, REFERENCE, MASK, ADVANTAGES, strict=True)
+    for new, old, sampler, reference, mask, advantage in rows:
         own = [at for at, present in enumerate(mask) if present]
-        whole = math.exp(sum(new[at] - old[at] for at in own))
-        mean = math.exp(sum(new[at] - old[at] for at in own) / len(own))
+        weights = ratios(old, sampler, own, level)
         tokens = []
-        for at in own:
-            rho = {
-                RatioLevel.TOKEN: math.exp(new[at] - old[at]),
-                RatioLevel.SEQUENCE: whole,
-                RatioLevel.MEAN: mean,
-            }[RatioLevel.MEAN if kind is LossKind.GSPO else ratio]
+        for at, rho, weight in zip(own, ratios(new, old, own, level), weights, strict=True):
             gain = min(rho * advantage, min(max(rho, 1 - low), 1 + high) * advantage)
+            gain *= 1 if cap is None else min(weight, cap)
             gap = reference[at] - new[at]
             tokens.append((gain, kl_coef * (math.exp(gap) - gap - 1)))
         plans.append(tokens)
@@ -82,6 +88,28 @@ def test_loss_equals_the_formula(kind, ratio):
     settings = settings_of(loss=kind, ratio=ratio, kl_coef=0.1)
     loss, _ = surrogate_loss(inputs(), settings, TOTALS)
     assert loss.item() == pytest.approx(by_hand(kind, ratio, 0.2, 0.28, 0.1), abs=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
+def test_truncated_importance_sampling_equals_the_formula(kind, ratio):
+    settings = settings_of(loss=kind, ratio=ratio, kl_coef=0.1, overlap="ahead", truncate_ratio=1.3)
+    sampler = torch.tensor(SAMPLER, dtype=torch.float64)
+    loss, metrics = surrogate_loss(inputs(sampler_logprobs=sampler), settings, TOTALS)
+    assert loss.item() == pytest.approx(by_hand(kind, ratio, 0.2, 0.28, 0.1, cap=1.3), abs=1e-12)
+    assert metrics.kl_to_old != surrogate_loss(inputs(), settings, TOTALS)[1].kl_to_old
+
+
+def test_truncated_weights_keep_the_gradient_that_the_clipped_ratio_drops():
+    good = torch.ones(4, dtype=torch.float64)
+    sampler = torch.tensor(OLD, dtype=torch.float64) - 1  # the policy has become e times as sure
+    clipped = inputs(new=OLD, old_logprobs=sampler, reference=None, advantages=good)
+    surrogate_loss(clipped, settings_of(), TOTALS)[0].backward()
+    assert clipped.logprobs.grad.abs().max() == 0
+    weighted = inputs(new=OLD, sampler_logprobs=sampler, reference=None, advantages=good)
+    plain = inputs(new=OLD, reference=None, advantages=good)
+    surrogate_loss(weighted, settings_of(overlap="ahead", truncate_ratio=2.0), TOTALS)[0].backward()
+    surrogate_loss(plain, settings_of(), TOTALS)[0].backward()
+    assert torch.allclose(weighted.logprobs.grad, 2 * plain.logprobs.grad)
 
 
 def test_paper_objective_equals_its_golden_value():

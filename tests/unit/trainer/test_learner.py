@@ -39,6 +39,7 @@ def learnt(entropy_coef):
         tokens=samples.tokens,
         mask=samples.mask,
         old_logprobs=samples.logprobs,
+        sampler_logprobs=samples.logprobs,
         reference=None,
         advantages=torch.linspace(-1, 1, PLANS),
         totals=LossTotals(PLANS, int(samples.mask.sum()), 6),

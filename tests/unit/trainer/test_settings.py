@@ -24,6 +24,23 @@ def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
             "[grpo]\ngroup = 1",
             r"setting 'grpo\.group': input should be greater than or equal to 2 \(found 1\)",
         ),
+        (
+            "[grpo]\nupdates_per_batch = 0",
+            r"'grpo\.updates_per_batch': input should be .* equal to 1 \(found 0\)",
+        ),
+        (
+            "[grpo]\ntasks_per_step = 4\nminibatches = 5",
+            r"'grpo\.minibatches': expected at most 4, the value of grpo\.tasks_per_step, .* \(found 5\)",
+        ),
+        ("[grpo]\noverlong = 'drop'", r"'grpo\.overlong': input should be 'keep' or 'mask' \(found 'drop'\)"),
+        (
+            "[grpo]\ntruncate_ratio = 2",
+            r"'grpo\.truncate_ratio': expected grpo\.overlap = 'ahead' with it, found 'stream', .* \(found 2\)",
+        ),
+        (
+            "[grpo]\noverlap = 'ahead'\ntruncate_ratio = 0.5",
+            r"'grpo\.truncate_ratio': .* equal to 1 \(found 0\.5\)",
+        ),
         ("[reward]\ngaol = 3", r"unknown setting 'reward\.gaol': correct its name"),
         ("[reward]\ngoal = -3", r"setting 'reward': .*goal: found -3: expected 0 or more"),
         ("[reward]\ngoal = 'much'", r"setting 'reward\.goal': input should be a valid number"),

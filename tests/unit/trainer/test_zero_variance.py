@@ -68,6 +68,7 @@ def step(*rewards, **changes):
             reserve=(),
             rng=np.random.default_rng,
             generator=torch.Generator().manual_seed(0),
+            order=np.random.default_rng,
             seed_of=lambda step, task_id: 0,
             rate_factor=1.0,
         )

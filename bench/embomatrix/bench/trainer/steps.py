@@ -104,7 +104,17 @@ def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
         chosen = [tasks[(step * load.tasks + at) % len(tasks)] for at in range(load.tasks)]
         began_s = time.process_time()
         updater.take_step(
-            StepPlan(step, chosen, (), (), np.random.default_rng, generator, lambda *_: 0, rate_factor=1.0)
+            StepPlan(
+                step=step,
+                tasks=chosen,
+                upcoming=(),
+                reserve=(),
+                rng=np.random.default_rng,
+                generator=generator,
+                order=np.random.default_rng,
+                seed_of=lambda *_: 0,
+                rate_factor=1.0,
+            )
         )
         spent_s.append(time.process_time() - began_s)
     torch.set_num_threads(threads)

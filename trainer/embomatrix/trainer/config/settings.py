@@ -6,7 +6,15 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.prompt import Codec
@@ -86,6 +94,13 @@ class ZeroVariance(StrEnum):
 
     SKIP = "skip"  # leave out the group: no forward and no backward pass
     KEEP = "keep"  # learn its KL and entropy terms, as TRL does
+
+
+class Overlong(StrEnum):
+    """Treatment of a plan that ``grpo.max_new`` cut off before its end token."""
+
+    KEEP = "keep"  # learn from it as from any other plan
+    MASK = "mask"  # leave its tokens out of the loss (DAPO's overlong filtering); its reward stays in the group's mean
 
 
 class _Frozen(BaseModel):
@@ -170,6 +185,13 @@ class GrpoSettings(_Frozen):
     """Plans per task: G."""
     chunk: int = Field(default=8, ge=1)
     """Tasks per microbatch. Its plans go to the cluster while the next microbatch is sampled."""
+    updates_per_batch: int = Field(default=1, ge=1)
+    """Passes over a step's plans. The ratio's denominator stays the policy that sampled them."""
+    minibatches: int = Field(default=1, ge=1)
+    """Optimiser steps per pass, at most ``tasks_per_step``. Each pass divides the groups anew, in a seeded order.
+
+    With more than one, the first update begins when all rewards of the step are there.
+    """
     learning_rate: float = Field(default=4e-4, gt=0)
     warmup_steps: int = Field(default=20, ge=0)
     """Steps of linear warm-up. Adam's first steps have full length for any gradient: without warm-up, the first small batches
@@ -180,6 +202,8 @@ class GrpoSettings(_Frozen):
     temperature: float = Field(default=1.0, gt=0)
     max_new: int = Field(default=72, ge=1)
     """Maximum tokens of a plan. If it is not given, a new run takes 1.5 times the longest oracle plan for training."""
+    overlong: Overlong = Overlong.KEEP
+    """Plans that ``max_new`` cut off."""
     loss: LossKind = LossKind.DAPO
     ratio: RatioLevel = RatioLevel.TOKEN
     clip_low: float = Field(default=0.2, gt=0, lt=1)
@@ -203,6 +227,12 @@ class GrpoSettings(_Frozen):
     zero_variance: ZeroVariance = ZeroVariance.SKIP
     """Groups whose rewards are all equal. ``LANGUAGE_MODEL_DEFAULTS`` keep them. A ``reserve`` replaces them in any case."""
     overlap: Overlap = Overlap.STREAM
+    truncate_ratio: float | None = Field(default=None, ge=1)
+    """Truncated importance sampling with ``Overlap.AHEAD``: largest weight of plans from older weights. None: off.
+
+    The ratio's denominator is then the policy at the beginning of the step, and the weight is the probability under it
+    over that under the sampling policy.
+    """
     reserve: int = Field(default=0, ge=0)
     """Dynamic sampling: maximum tasks per step that replace zero-variance groups."""
     curriculum_tasks: int = Field(default=0, ge=0)
@@ -213,6 +243,28 @@ class GrpoSettings(_Frozen):
     """Weight of the reward's relevance tier in the advantage. 0 leaves the tier out."""
     relevance_final: float | None = Field(default=None, ge=0)
     """Weight at the end of the budget, reached linearly. None: constant."""
+
+    @field_validator("minibatches")
+    @classmethod
+    def _check_minibatches(cls, value: int, info: ValidationInfo) -> int:
+        tasks = info.data.get("tasks_per_step", value)
+        if value > tasks:
+            raise ValueError(
+                f"expected at most {tasks}, the value of grpo.tasks_per_step, because a minibatch has at least one task: "
+                "lower it, or raise grpo.tasks_per_step"
+            )
+        return value
+
+    @field_validator("truncate_ratio")
+    @classmethod
+    def _check_truncate_ratio(cls, value: float | None, info: ValidationInfo) -> float | None:
+        overlap = info.data.get("overlap", Overlap.AHEAD)
+        if value is not None and overlap is not Overlap.AHEAD:
+            raise ValueError(
+                f"expected grpo.overlap = 'ahead' with it, found {overlap.value!r}, with which the policy that learns has "
+                "sampled the plans: leave it out, or change grpo.overlap"
+            )
+        return value
 
     @property
     def ratio_level(self) -> RatioLevel:

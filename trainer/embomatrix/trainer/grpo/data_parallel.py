@@ -86,6 +86,10 @@ class RemoteLearner:
         samples: Samples = self._request("sample", tuple(prompts), seed)
         return samples
 
+    def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
+        logprobs: Tensor = self._request("current_logprobs", tuple(prompts), tokens, mask)
+        return logprobs
+
     def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
         logprobs: Tensor = self._request("reference_logprobs", tuple(prompts), tokens, mask)
         return logprobs
@@ -136,6 +140,7 @@ class _Requests:
         self._gradient.close()
         self._learner = Learner(policy, saved_policy(reference, settings).frozen_copy(), settings.grpo)
         self.sample = self._learner.sample
+        self.current_logprobs = self._learner.current_logprobs
         self.reference_logprobs = self._learner.reference_logprobs
 
     def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[bool]]:
@@ -206,6 +211,10 @@ class DataParallelWorkers:
         ]
         weights.close()
         return cls(local, remotes)
+
+    @property
+    def has_remotes(self) -> bool:
+        return bool(self._remotes)
 
     def remote(self, index: int) -> RemoteLearner | None:
         """Return the owner of the microbatch with this index. None: this process."""

@@ -15,14 +15,15 @@ from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 class Microbatch:
     """Part of a step that is back-propagated at once: ``prompts``, and one group of plans per prompt as rows.
 
-    ``tokens``, ``mask``, ``old_logprobs`` and ``reference`` have shape (plans, tokens); ``advantages`` has (plans,).
-    ``totals`` holds the denominators of the loss.
+    ``tokens``, ``mask``, ``old_logprobs``, ``sampler_logprobs`` and ``reference`` have shape (plans, tokens);
+    ``advantages`` has (plans,). ``totals`` holds the denominators of the loss.
     """
 
     prompts: Sequence[Tokens]
     tokens: Tensor
     mask: Tensor
     old_logprobs: Tensor
+    sampler_logprobs: Tensor
     reference: Tensor | None
     advantages: Tensor
     totals: LossTotals
@@ -42,6 +43,12 @@ class Learner:
         device = next(iter(self._policy.parameters())).device
         generator = torch.Generator(device).manual_seed(seed)
         return self._policy.sample(prompts, settings.group, settings.temperature, settings.max_new, generator)
+
+    @torch.no_grad()
+    def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
+        """Return log-probabilities (plans, tokens) under the policy."""
+        settings = self._settings
+        return self._policy.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
 
     @torch.no_grad()
     def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
@@ -67,6 +74,7 @@ class Learner:
             advantages=microbatch.advantages,
             reference=microbatch.reference,
             entropy=scores.entropy,
+            sampler_logprobs=microbatch.sampler_logprobs,
         )
         loss, metrics = surrogate_loss(inputs, settings, microbatch.totals)
         torch.autograd.backward(loss)

@@ -6,7 +6,10 @@ The paper's objective (section "Learning algorithms") for B tasks with G plans e
 
 with one importance ratio rho per *plan*: ``LossKind.PAPER`` with ``RatioLevel.SEQUENCE``. A step's loss is a sum over
 groups, so microbatches can be back-propagated one by one as results arrive. ``LossTotals`` carries the denominators of
-the whole step.
+the whole step, or of a minibatch.
+
+``GrpoSettings.truncate_ratio`` is truncated importance sampling, Yao et al. 2025: plans of an older policy mu are weighted
+with min(policy at the beginning of the step / mu, C), and the ratio compares the policy with that at the beginning.
 
 Sources of the other kinds: GRPO, Shao et al. 2024 (DeepSeekMath); DAPO, Yu et al. 2025; Dr. GRPO, Liu et al. 2025; GSPO,
 Zheng et al. 2025; BNPO as in TRL. All kinds equal TRL's losses in value and gradient (tests/peers/test_losses_of_trl.py).
@@ -22,7 +25,7 @@ from embomatrix.trainer.config.settings import GrpoSettings, LossKind, RatioLeve
 
 @dataclass(frozen=True, slots=True)
 class LossTotals:
-    """Totals of the whole step: the denominators of the loss.
+    """Totals of the whole step, or of a minibatch: the denominators of the loss.
 
     For BNPO, ``tokens`` is the microbatch's own count times ``microbatches``. ``longest`` is the maximum number of tokens
     of a plan; only Dr. GRPO uses it.
@@ -65,6 +68,7 @@ class LossInputs:
 
     ``mask`` is true on a plan's tokens, including the end token, and false on all of a lost plan. ``reference`` and
     ``entropy`` may be None if their coefficients are 0. With coefficient 0, ``entropy`` is only logged and needs no gradient.
+    ``sampler_logprobs`` is None if the policy of ``old_logprobs`` sampled the plans.
     """
 
     logprobs: Tensor
@@ -73,6 +77,7 @@ class LossInputs:
     advantages: Tensor
     reference: Tensor | None = None
     entropy: Tensor | None = None
+    sampler_logprobs: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +96,14 @@ def surrogate_loss(
 ) -> tuple[Tensor, LossMetrics]:
     """Return the microbatch's share of the step's loss (a scalar to minimise). All shares add up to the step's loss."""
     mask = inputs.mask.to(inputs.logprobs.dtype)  # (plans, tokens)
-    log_ratio = (inputs.logprobs - inputs.old_logprobs) * mask  # (plans, tokens)
-    if settings.ratio_level is not RatioLevel.TOKEN:
-        log_ratio = log_ratio.sum(dim=1, keepdim=True)  # (plans, 1)
-    if settings.ratio_level is RatioLevel.MEAN:
-        log_ratio = log_ratio / mask.sum(dim=1, keepdim=True).clamp(min=1)
-    importance_ratio = log_ratio.exp()  # (plans, tokens or 1)
+    level = settings.ratio_level
+    importance_ratio = _ratio(inputs.logprobs, inputs.old_logprobs, mask, level)  # (plans, tokens or 1)
     advantages = inputs.advantages[:, None]  # (plans, 1)
     clipped = importance_ratio.clamp(1 - settings.clip_low, 1 + settings.clip_high)
     gain = torch.minimum(importance_ratio * advantages, clipped * advantages)  # (plans, tokens or 1)
+    if settings.truncate_ratio is not None and inputs.sampler_logprobs is not None:
+        weight = _ratio(inputs.old_logprobs, inputs.sampler_logprobs, mask, level)  # (plans, tokens or 1)
+        gain = gain * weight.clamp(max=settings.truncate_ratio)
     cost = torch.zeros_like(inputs.logprobs)  # (plans, tokens)
     if inputs.reference is not None and settings.kl_coef > 0:
         cost = cost + settings.kl_coef * kl_estimate(inputs.logprobs, inputs.reference)
@@ -107,6 +111,16 @@ def surrogate_loss(
         cost = cost - settings.entropy_coef * inputs.entropy
     loss = _average(cost, mask, settings.loss, totals) - _average_gain(gain, mask, settings, totals)
     return loss, _metrics(inputs, mask, importance_ratio, settings)
+
+
+def _ratio(logprobs: Tensor, old_logprobs: Tensor, mask: Tensor, level: RatioLevel) -> Tensor:
+    """Return the ratio of probabilities: (plans, tokens) for ``TOKEN``, (plans, 1) for the levels of a plan."""
+    log_ratio = (logprobs - old_logprobs) * mask  # (plans, tokens)
+    if level is not RatioLevel.TOKEN:
+        log_ratio = log_ratio.sum(dim=1, keepdim=True)  # (plans, 1)
+    if level is RatioLevel.MEAN:
+        log_ratio = log_ratio / mask.sum(dim=1, keepdim=True).clamp(min=1)
+    return log_ratio.exp()
 
 
 def kl_estimate(logprobs: Tensor, reference: Tensor) -> Tensor:
@@ -150,10 +164,11 @@ def _metrics(
         return float((values * mask).sum() / tokens)
 
     reference, entropy = inputs.reference, inputs.entropy
+    sampler = inputs.old_logprobs if inputs.sampler_logprobs is None else inputs.sampler_logprobs
     return LossMetrics(
         clip_fraction=mean((low | high).to(mask.dtype).expand_as(mask)),
         kl_to_reference=0.0 if reference is None else mean(kl_estimate(inputs.logprobs, reference)),
-        kl_to_old=mean(kl_estimate(inputs.logprobs, inputs.old_logprobs)),
+        kl_to_old=mean(kl_estimate(inputs.logprobs, sampler)),
         entropy=0.0 if entropy is None else mean(entropy),
         weight=int(mask.sum()),
     )

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 class StepRecord:
     """Metrics of one step.
 
-    Rates are over rollouts with a result. Token means are over the plans that had a gradient, None if there were none.
+    Rates are over rollouts with a result. Token means are over the plans that had a gradient, in all updates of the step,
+    None if there were none. ``gradient_norm`` is the mean over the updates.
     ``reward_format``, ``reward_relevance`` and ``reward_goal`` are the means of the tiers and add up to ``reward``.
     ``kl`` is to the reference policy, ``kl_to_old`` to the policy that sampled.
     """
@@ -42,6 +43,8 @@ class StepRecord:
     learning_rate: float
     rollouts: int
     lost: int
+    cut_off: float
+    """Share of the rollouts that ``grpo.max_new`` cut off before their end token."""
     warm: float
     shared: float
     """Share of the steps that were known from equal plans or equal beginnings and not executed."""
@@ -49,18 +52,22 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class GroupLog:
-    """One task's plans of a step. ``zero_variance``: equal rewards or too few of them, so all advantages are 0."""
+    """One task's plans of a step. ``zero_variance``: equal rewards or too few of them, so all advantages are 0.
+
+    ``cut_off`` counts the plans without an end token.
+    """
 
     task: TrainingTask
     outcomes: tuple[PlanOutcome, ...]
     advantages: tuple[float, ...]
     zero_variance: bool
+    cut_off: int
 
 
 def record_of(
-    step: int, logs: Sequence[GroupLog], metrics: Sequence[LossMetrics], norm: float, rate: float
+    step: int, logs: Sequence[GroupLog], metrics: Sequence[LossMetrics], norms: Sequence[float], rate: float
 ) -> StepRecord:
-    """Summarise a step from its groups, the metrics of its microbatches, the gradient norm and the learning rate."""
+    """Summarise a step from its groups, the metrics of its microbatches, its gradient norms and the learning rate."""
     outcomes = [outcome for log in logs for outcome in log.outcomes]
     known = [outcome for outcome in outcomes if outcome.reward is not None]
     rewards = [outcome.reward for outcome in known if outcome.reward is not None]
@@ -89,10 +96,11 @@ def record_of(
         kl=over_tokens("kl_to_reference"),
         kl_to_old=over_tokens("kl_to_old"),
         clipped=over_tokens("clip_fraction"),
-        gradient_norm=norm,
+        gradient_norm=_mean(norms),
         learning_rate=rate,
         rollouts=len(outcomes),
         lost=len(outcomes) - len(known),
+        cut_off=sum(log.cut_off for log in logs) / max(1, len(outcomes)),
         warm=_mean([outcome.warm for outcome in executed]),
         shared=sum(outcome.shared_steps for outcome in executed) / max(1, steps),
     )

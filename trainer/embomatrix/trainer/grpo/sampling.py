@@ -14,12 +14,12 @@ from torch import Tensor
 
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome, PlanSubmitter, result_of
+from embomatrix.trainer.config.settings import GrpoSettings, Overlong
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
 
 if TYPE_CHECKING:
-    from embomatrix.trainer.config.settings import GrpoSettings
     from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
     from embomatrix.trainer.grpo.learner import Learner
 
@@ -30,23 +30,28 @@ _SEEDS: Final = 2**62
 class SampledChunk:
     """Tasks that were sampled together, with the futures of their rewards. ``index`` counts a step's chunks from 0.
 
-    ``reference``: log-probabilities (plans, tokens) of the reference policy, None without a KL term.
+    ``mask`` (plans, tokens) is the samples' mask without the plans that ``Overlong.MASK`` leaves out. ``reference``:
+    log-probabilities (plans, tokens) of the reference policy, None without a KL term. ``old_logprobs``: those of the policy
+    at the beginning of the step, None if they are not needed or the samples' own.
     """
 
     index: int
     tasks: Sequence[TrainingTask]
     prompts: Sequence[TaskPrompt]
     samples: Samples
+    mask: Tensor
     futures: Sequence[Future[tuple[PlanOutcome, ...]]]
-    reference: Tensor | None
+    reference: Tensor | None = None
+    old_logprobs: Tensor | None = None
 
     @property
     def plans(self) -> int:
-        return int(self.samples.mask.shape[0])
+        return int(self.mask.shape[0])
 
     @property
     def tokens(self) -> int:
-        return int(self.samples.mask.sum())
+        """Tokens in the denominator of the loss."""
+        return int(self.mask.sum())
 
     @property
     def is_complete(self) -> bool:
@@ -104,6 +109,12 @@ class Sampler:
             [(chunk.index, functools.partial(_with_reference, chunk)) for chunk in chunks]
         )
 
+    def with_old_logprobs(self, chunks: Sequence[SampledChunk]) -> list[SampledChunk]:
+        """Return chunks that older weights sampled with their log-probabilities under the current ones."""
+        return self._workers.map(
+            [(chunk.index, functools.partial(_with_old_logprobs, chunk)) for chunk in chunks]
+        )
+
     def _chunk(
         self,
         step: int,
@@ -126,10 +137,19 @@ class Sampler:
         ]
         futures = self._gateway.submit(f"step-{step}-{index}", step, plans, self._codec)
         tasks, task_prompts = zip(*prompts, strict=True)
-        return SampledChunk(index, tasks, task_prompts, samples, futures, None)
+        mask = samples.mask
+        if self._settings.overlong is Overlong.MASK:
+            mask = mask & ~samples.cut_off[:, None]
+        return SampledChunk(index, tasks, task_prompts, samples, mask, futures)
 
 
 def _with_reference(chunk: SampledChunk, learner: Learner | RemoteLearner) -> SampledChunk:
     prompts = [prompt.tokens for prompt in chunk.prompts]
     logprobs = learner.reference_logprobs(prompts, chunk.samples.tokens, chunk.samples.mask)
     return replace(chunk, reference=logprobs)
+
+
+def _with_old_logprobs(chunk: SampledChunk, learner: Learner | RemoteLearner) -> SampledChunk:
+    prompts = [prompt.tokens for prompt in chunk.prompts]
+    logprobs = learner.current_logprobs(prompts, chunk.samples.tokens, chunk.samples.mask)
+    return replace(chunk, old_logprobs=logprobs)

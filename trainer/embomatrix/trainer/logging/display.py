@@ -63,6 +63,8 @@ class LineDisplay:
             "entropy": "–" if record.entropy is None else f"{record.entropy:.2f}",
             "zero-variance groups": f"{record.zero_variance_groups:.0%}",
         }
+        if record.cut_off:
+            figures["cut-off plans"] = f"{record.cut_off:.1%}"
         self._clock.note(Phase.GRPO, share, time.monotonic())
         self._show("GRPO", share, figures)
 

@@ -194,7 +194,7 @@ class HfPolicy:
                 states = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)
                 scores = self._head(states)[:, -1].float()
         drawn, own = torch.stack(tokens, dim=1), torch.stack(masks, dim=1)
-        return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own))
+        return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own), ~done)
 
     def logprobs(
         self,

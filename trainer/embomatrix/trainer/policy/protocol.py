@@ -21,13 +21,15 @@ class Samples:
     """``group`` completions per prompt: row q * group + i is sample i of prompt q.
 
     ``tokens``, ``mask`` and ``logprobs`` have shape (rows, longest completion). ``mask`` is true up to and including the
-    end token. Log-probabilities are at the sampling temperature.
+    end token. Log-probabilities are at the sampling temperature. ``cut_off`` (rows,) is true for completions that reached
+    the maximum length without an end token.
     """
 
     tokens: Tensor
     mask: Tensor
     logprobs: Tensor
     texts: tuple[str, ...]
+    cut_off: Tensor
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,9 +159,10 @@ class TinyPolicy:
                     state, choice = state.select(kept), choice[kept]
                 hidden, plan = self.module.extend(state.prompts, choice[:, None], state.plan)
                 state = replace(state, plan=plan)
-        tokens = tokens[:, :length]
+        tokens, mask = tokens[:, :length], mask[:, :length]
         texts = tuple(self.vocabulary.decode(row) for row in tokens.tolist())
-        return Samples(tokens, mask[:, :length], logprobs[:, :length], texts)
+        cut_off = mask[:, -1] & (tokens[:, -1] != END)
+        return Samples(tokens, mask, logprobs[:, :length], texts, cut_off)
 
     def _initial_state(self, prompts: Sequence[Tokens], group: int) -> _SamplingState:
         """Start ``group`` empty plans per prompt."""

@@ -95,9 +95,12 @@ class TrainingRun:
             self._recorder.forget_after(self._progress.step, METRICS, SAMPLES, EVALUATIONS)
             try:
                 self._optimise(updater)
-            finally:
-                checkpoint = self._save(updater)
-        return checkpoint
+            except BaseException:
+                # A step that was taken by half can't be resumed: the checkpoint before it stays the newest.
+                if not updater.is_between_updates:
+                    self._save(updater)
+                raise
+            return self._save(updater)
 
     def _load_tensors(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])
@@ -188,6 +191,7 @@ class TrainingRun:
             reserve=reserve.take(settings.reserve),
             rng=self._rng,
             generator=self._generator,
+            order=self._order,
             seed_of=self._seed_of,
             rate_factor=self._rate_factor(step, share),
             relevance=settings.relevance + (end - settings.relevance) * share,
@@ -195,6 +199,9 @@ class TrainingRun:
 
     def _rng(self, step: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, step)))
+
+    def _order(self, step: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence((self._settings.seed, 4, step)))
 
     def _seed_of(self, step: int, task_id: str) -> int:
         """Return the seed of a task's rollouts in a step. An epoch has as many draws as there are tasks."""
