@@ -202,7 +202,7 @@ def table() -> dict[str, Decoder]:
             _tiny,
             (TrainerError,),
             lambda: (_small_policy()[0],),
-            frozenset({"trainer.policy.tiny:TinyPolicy.load"}),
+            frozenset({"trainer.policy.tiny:TinyPolicy.described_in"}),
             mutate_json,
         ),
         "codec of a model": Decoder(

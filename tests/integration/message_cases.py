@@ -598,6 +598,12 @@ COMMANDS = (
         "embomatrix model import-gguf",
     ),
     CommandCase(
+        "memory of an unknown model",
+        "train --plan-memory=tinny --dataset=KITCHEN",
+        "'tinny'",
+        "embomatrix model import-gguf",
+    ),
+    CommandCase(
         "unknown setting",
         "train --settings=FILES/speed.toml --dataset=KITCHEN --out=FILES/new",
         "'speed'",

@@ -14,6 +14,7 @@ import numpy as np
 
 from embomatrix.bench.cluster.processes import output_of
 from embomatrix.bench.report.figures import BenchError
+from embomatrix.bench.trainer.memory import random_llama_error
 from embomatrix.bench.trainer.steps import load_of, own_step_s, trl_step_s
 from embomatrix.cli.local_cluster import local_cluster
 from embomatrix.cli.supervisor import embomatrix_command
@@ -63,7 +64,12 @@ def measure_steps(
     load = load_of(tasks)
     on_step("our steps")
     own = own_step_s(load, tasks)
-    found = [Figure("grpo_step_cpu_s", float(np.median(own)), "s", Better.LOWER, len(own))]
+    on_step("the memory of our steps")
+    plan_error = abs(random_llama_error(load, tasks))
+    found = [
+        Figure("grpo_step_cpu_s", float(np.median(own)), "s", Better.LOWER, len(own)),
+        Figure("memory_plan_error", plan_error, "", Better.LOWER, 1, 0.15),
+    ]
     if trl is None:
         return found
     on_step("TRL's steps")

@@ -101,6 +101,16 @@ def train(
     record: Annotated[
         Path | None, typer.Option(help="File for every submitted plan, to replay with `bench traffic`.")
     ] = None,
+    plan_memory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL",
+            help="Print the peak memory of a run with this model and these settings, and end. Weights are not read.",
+        ),
+    ] = None,
+    gpu_gb: Annotated[
+        float, typer.Option(min=0.1, help="Memory of the GPU for --plan-memory, in GB.")
+    ] = 80.0,
     token: Token = "",
     ca: Ca = None,
     log_format: _LOG_FORMAT = None,
@@ -124,6 +134,12 @@ def train(
             "track": track,
             **_coefficients(reward or ()),
         }
+        if plan_memory is not None:
+            from embomatrix.trainer.run.memory import forecast, memory_text
+
+            found = forecast(dataset, plan_memory, settings_file, changes)
+            typer.echo(memory_text(found, gpu_gb))
+            return
         from embomatrix.trainer.run.timetable import clock_of
 
         prepare_output("train", record)

@@ -393,6 +393,11 @@ def _check_available(name: str) -> None:
                 f"the model folder {name} has no tokenizer: copy the model's tokenizer.json and tokenizer_config.json into it"
             )
         return
+    check_on_hub(name)
+
+
+def check_on_hub(name: str) -> None:
+    """Raise TrainerError unless the configuration of a model is cached, or the hub knows the model."""
     from huggingface_hub import HfApi, try_to_load_from_cache
 
     try:

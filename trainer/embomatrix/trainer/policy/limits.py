@@ -18,11 +18,14 @@ from embomatrix.skills.syntax import Skill
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.variation import used_rows
 from embomatrix.trainer.policy.prompts import plan_text
+from embomatrix.trainer.policy.tiny import longest_prompt
 
 if TYPE_CHECKING:
     from embomatrix.trainer.config.settings import TrainSettings
     from embomatrix.trainer.data.tasks import TaskSet, TrainingTask
+    from embomatrix.trainer.policy.decoder import DecoderShape
     from embomatrix.trainer.policy.protocol import Policy
+    from embomatrix.trainer.policy.vocabulary import Vocabulary
 
 MARGIN: Final = 1.5
 """``grpo.max_new`` is by default the longest oracle plan of the training tasks times this: a policy's plans vary around it."""
@@ -35,6 +38,11 @@ WARNING_SHARE: Final = 0.05
 """Share of inexpressible tasks above which a warning is printed."""
 CHARACTERS_PER_TOKEN: Final = 2.0
 """Estimate for an endpoint, whose tokenizer is unknown. SmolLM2 needs a token for 2.6 characters of a plan in JSON."""
+
+CHARACTERS_PER_PROMPT_TOKEN: Final = 2.9
+"""Fewest characters of a token of SmolLM2 in the prompts of the shipped tasks. Larger vocabularies have more."""
+CHARACTERS_PER_PLAN_TOKEN: Final = {Codec.LINES: 1.6, Codec.JSON: 2.5}
+"""The same in their oracle plans."""
 
 
 class Obstacle(StrEnum):
@@ -76,6 +84,28 @@ class Ruler:
             lambda prompt: len(policy.encode(prompt)),
             lambda text: len(policy.encode_plan(text)),
             policy.unknown_words,
+        )
+
+    @staticmethod
+    def of_vocabulary(vocabulary: Vocabulary, shape: DecoderShape) -> Ruler:
+        """Measure with the vocabulary of a word-level policy, without the policy."""
+        return Ruler(
+            Codec.NAMES,
+            shape.longest,
+            lambda prompt: min(len(vocabulary.encode(prompt.user)), longest_prompt(shape)) + 1,
+            lambda text: len(vocabulary.encode(text)) + 1,
+            vocabulary.unknown_words,
+        )
+
+    @staticmethod
+    def of_unread_tokenizer(codec: Codec) -> Ruler:
+        """Estimate the tokens of a language model from the characters: rather too many than too few."""
+        return Ruler(
+            codec,
+            None,
+            lambda prompt: math.ceil(len(prompt.system + prompt.user) / CHARACTERS_PER_PROMPT_TOKEN),
+            lambda text: math.ceil(len(text) / CHARACTERS_PER_PLAN_TOKEN[codec]),
+            lambda _: frozenset(),
         )
 
     @staticmethod
@@ -133,7 +163,11 @@ def with_limits(settings: TrainSettings, policy: Policy, tasks: TaskSet) -> Trai
     ``MARGIN``, at most what the longest prompt leaves of the model's context. Without oracle plans, settings keep their
     defaults. Raises TrainerError if a prompt leaves no room for a plan.
     """
-    ruler = Ruler.of_policy(policy)
+    return with_measured_limits(settings, Ruler.of_policy(policy), tasks)
+
+
+def with_measured_limits(settings: TrainSettings, ruler: Ruler, tasks: TaskSet) -> TrainSettings:
+    """Return the settings of ``with_limits`` for a model that is known by its ruler alone."""
     taught = [task for task in tasks.train if task.oracle]
     if taught and "rows" not in settings.prompt.model_fields_set:
         rows = max(map(rows_needed, taught))

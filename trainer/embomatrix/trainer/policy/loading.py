@@ -15,7 +15,7 @@ from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.lora import has_adapters
 from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.policy.vocabulary import build_vocabulary
+from embomatrix.trainer.policy.vocabulary import Vocabulary, build_vocabulary
 
 if TYPE_CHECKING:
     from embomatrix.trainer.data.tasks import TaskSet
@@ -43,15 +43,10 @@ def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
     """Create the initial policy of a run. Raises TrainerError if the model is unknown or can't be loaded."""
     if not is_word_level(settings.model):
         return _language_model(settings.model, settings)
-    if settings.lora.rank or settings.gradient_checkpointing:
-        raise TrainerError(
-            "lora and gradient_checkpointing are for Hugging Face models, not for the word-level policy: leave them out"
-        )
     if settings.model != TINY:
+        check_word_level(settings)
         return saved_policy(Path(settings.model), settings)
-    situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
-    vocabulary = build_vocabulary(situations, [task.task.instruction for task in tasks.train])
-    shape = DecoderShape(len(vocabulary), **settings.tiny.model_dump())
+    vocabulary, shape = word_level_shape(settings, tasks)
     return TinyPolicy(
         vocabulary,
         shape,
@@ -59,6 +54,31 @@ def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
         device=settings.device,
         compute_dtype=torch_dtype(settings.compute_dtype, settings.device),
     )
+
+
+def check_word_level(settings: TrainSettings) -> None:
+    """Raise TrainerError if settings of Hugging Face models are given for the word-level policy."""
+    if settings.lora.rank or settings.gradient_checkpointing:
+        raise TrainerError(
+            "lora and gradient_checkpointing are for Hugging Face models, not for the word-level policy: leave them out"
+        )
+
+
+def word_level_shape(settings: TrainSettings, tasks: TaskSet) -> tuple[Vocabulary, DecoderShape]:
+    """Return the vocabulary and the shape of a word-level policy, new or saved, without its weights. Raises TrainerError."""
+    check_word_level(settings)
+    if settings.model != TINY:
+        try:
+            return TinyPolicy.described_in(Path(settings.model))
+        except DAMAGE as error:
+            raise _damaged(Path(settings.model), error) from error
+    situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
+    vocabulary = build_vocabulary(situations, [task.task.instruction for task in tasks.train])
+    return vocabulary, DecoderShape(len(vocabulary), **settings.tiny.model_dump())
+
+
+def _damaged(folder: Path, error: BaseException) -> TrainerError:
+    return TrainerError(f"the policy in {folder} is damaged ({reason_of(error)}): use another checkpoint")
 
 
 def saved_policy(folder: Path, settings: TrainSettings, *, learns: bool = True) -> Policy:
@@ -71,9 +91,7 @@ def saved_policy(folder: Path, settings: TrainSettings, *, learns: bool = True) 
             compute_dtype = torch_dtype(settings.compute_dtype, settings.device)
             return TinyPolicy.load(folder, device=settings.device, compute_dtype=compute_dtype)
     except DAMAGE as error:
-        raise TrainerError(
-            f"the policy in {folder} is damaged ({reason_of(error)}): use another checkpoint"
-        ) from error
+        raise _damaged(folder, error) from error
     if settings.lora.rank and has_adapters(folder):
         return _language_model(settings.model, settings, folder)
     if HfPolicy.is_saved_in(folder):

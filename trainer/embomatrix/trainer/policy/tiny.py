@@ -41,6 +41,11 @@ MAX_CONTEXT: Final = 65_536
 """Tokens of the longest context of a saved policy."""
 
 
+def longest_prompt(shape: DecoderShape) -> int:
+    """Return the tokens that a prompt may have before GO."""
+    return shape.longest * 3 // 4
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _SamplingState:
     """Plans during sampling: their rows in the result, a mask of active rows, and the model's and the grammar's state."""
@@ -114,8 +119,7 @@ class TinyPolicy:
     def encode(self, prompt: Prompt) -> Tokens:
         """Return the prompt's tokens. Prompts beyond three quarters of the context lose their beginning."""
         tokens = self.vocabulary.encode(prompt.user)
-        longest = self.module.shape.longest * 3 // 4
-        return (*tokens[-longest:], GO)
+        return (*tokens[-longest_prompt(self.module.shape) :], GO)
 
     def encode_plan(self, text: str) -> Tokens:
         return (*self.vocabulary.encode(text), END)
@@ -255,22 +259,28 @@ class TinyPolicy:
     @classmethod
     def load(cls, folder: Path, *, device: str = "cpu", compute_dtype: torch.dtype = torch.float32) -> Self:
         """Load a policy that ``save`` wrote. Raises OSError, ValueError or RuntimeError if it is damaged."""
+        vocabulary, shape = cls.described_in(folder)
+        weights = read_tensors(folder / _WEIGHTS, device=device)
+        check_weights(shape, weights)
+        policy = cls(vocabulary, shape, seed=0, device=device, compute_dtype=compute_dtype)
+        policy.module.load_state_dict(weights)
+        return policy
+
+    @staticmethod
+    def described_in(folder: Path) -> tuple[Vocabulary, DecoderShape]:
+        """Read the vocabulary and the shape of a saved policy, not its weights. Raises OSError, ValueError, TypeError or
+        LookupError if the description is damaged.
+        """
         description = parse_json((folder / _DESCRIPTION).read_bytes())
         shape = DecoderShape(**description["shape"])
         words, objects, rooms = (tuple(map(str, description[part])) for part in ("words", "objects", "rooms"))
-        vocabulary, weights = (
-            Vocabulary(words, objects, rooms),
-            read_tensors(folder / _WEIGHTS, device=device),
-        )
+        vocabulary = Vocabulary(words, objects, rooms)
         if len(vocabulary) != shape.vocabulary or not 0 < shape.longest <= MAX_CONTEXT:
             raise ValueError(
                 f"{_DESCRIPTION} has {len(vocabulary)} words and a context of {shape.longest}: expected {shape.vocabulary} "
                 f"words, and 1 to {MAX_CONTEXT}"
             )
-        check_weights(shape, weights)
-        policy = cls(vocabulary, shape, seed=0, device=device, compute_dtype=compute_dtype)
-        policy.module.load_state_dict(weights)
-        return policy
+        return vocabulary, shape
 
     @staticmethod
     def is_saved_in(folder: Path) -> bool:

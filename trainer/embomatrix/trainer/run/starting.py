@@ -89,8 +89,7 @@ def start_run(
     dataset: Path, out: Path, model: str, settings_file: Path | None, changes: Mapping[str, Any]
 ) -> RunStart:
     """Start a new run in the folder ``out``, which is created. Raises TrainerError if it holds a run already."""
-    defaults = {"threads": default_threads(), **({} if is_word_level(model) else _language_defaults(model))}
-    settings = read_settings(settings_file, {**changes, "model": model}, defaults)
+    settings = new_settings(model, settings_file, changes)
     if "processes" not in settings.model_fields_set:
         settings = settings.model_copy(update={"processes": _processes_for(settings)})
     if any((out / CHECKPOINTS).glob("[!.]*")):
@@ -107,6 +106,12 @@ def start_run(
             f"the folder {out} can't be created ({error.strerror}): pass another --out"
         ) from error
     return RunStart(settings, tasks, policy, TrainingProgress(dataset=digest_of(tasks)))
+
+
+def new_settings(model: str, settings_file: Path | None, changes: Mapping[str, Any]) -> TrainSettings:
+    """Return the settings of a new run, before its limits and processes are derived. Raises TrainerError."""
+    defaults = {"threads": default_threads(), **({} if is_word_level(model) else _language_defaults(model))}
+    return read_settings(settings_file, {**changes, "model": model}, defaults)
 
 
 def _check_free(out: Path) -> None:
