@@ -40,7 +40,8 @@ class _LongPlanLearner(Learner):
         tokens, mask, logprobs = (
             each[longest].repeat(len(each), 1) for each in (drawn.tokens, drawn.mask, drawn.logprobs)
         )
-        return Samples(tokens, mask, logprobs, drawn.texts)
+        cut_off = drawn.cut_off[longest].repeat(len(tokens))
+        return Samples(tokens, mask, logprobs, cut_off, drawn.texts)
 
 
 def plan_error(
@@ -62,7 +63,17 @@ def plan_error(
 
     def take_step(step: int) -> None:
         updater.take_step(
-            StepPlan(step, chosen, (), (), np.random.default_rng, generator, lambda *_: 0, rate_factor=1.0)
+            StepPlan(
+                step=step,
+                tasks=chosen,
+                upcoming=(),
+                reserve=(),
+                rng=np.random.default_rng,
+                generator=generator,
+                order=np.random.default_rng,
+                seed_of=lambda *_: 0,
+                rate_factor=1.0,
+            )
         )
 
     take_step(1)
