@@ -8,7 +8,7 @@ from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.bench.trainer.memory import plan_error
-from embomatrix.starter.shipped import unpack
+from embomatrix.starter.shipped import unpack_part
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
 from embomatrix.trainer.data.tasks import load_tasks
@@ -106,7 +106,7 @@ def test_plan_of_a_language_model_reads_its_configuration_only(kitchen, llama_8b
 
 
 def test_printed_plan_of_the_page_is_that_of_the_shipped_tasks(llama_8b, tmp_path, monkeypatch):
-    unpack(tmp_path / "shipped")
+    unpack_part(tmp_path / "shipped", 1)
     monkeypatch.chdir(llama_8b.parent)
     found = forecast(tmp_path / "shipped", llama_8b.name, None, {})
     assert f"```text\n{memory_text(found, 80.0)}\n```" in PAGE.read_text(encoding="utf-8")
