@@ -41,7 +41,7 @@ class _LongPlanLearner(Learner):
             each[longest].repeat(len(each), 1) for each in (drawn.tokens, drawn.mask, drawn.logprobs)
         )
         cut_off = drawn.cut_off[longest].repeat(len(tokens))
-        return Samples(tokens, mask, logprobs, cut_off, drawn.texts)
+        return Samples(tokens, mask, logprobs, drawn.texts, cut_off)
 
 
 def plan_error(

@@ -132,11 +132,12 @@ class Updater:
     def _chunks(self, plan: StepPlan) -> list[SampledChunk]:
         """Return this step's chunks, sampled now or one step ago. With ``AHEAD``, also sample the next step's."""
         ready, self._ahead = self._ahead, None
-        step, chunks = ready or (0, [])
-        if step != plan.step:
+        if ready is None or ready[0] != plan.step:
             chunks = self._sample(plan, plan.step, plan.tasks)
         elif self._settings.truncate_ratio is not None:
-            chunks = self._sampler.with_old_logprobs(chunks)
+            chunks = self._sampler.with_old_logprobs(ready[1])
+        else:
+            chunks = ready[1]
         if self._settings.overlap is Overlap.AHEAD and plan.upcoming:
             coming = plan.step + 1
             self._ahead = coming, self._sample(plan, coming, plan.upcoming)

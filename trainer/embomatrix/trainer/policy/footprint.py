@@ -380,7 +380,10 @@ class LanguageModelFootprint:
 
 @dataclass(frozen=True, slots=True)
 class WordLevelFootprint:
-    """Memory of the word-level policy. ``casts``: its linear layers multiply in bfloat16."""
+    """Memory of the word-level policy. ``casts``: its linear layers multiply in bfloat16.
+
+    Scores are planned for the whole vocabulary. The policy scores a shortlist, which the plan does not know.
+    """
 
     shape: DecoderShape
     casts: bool
