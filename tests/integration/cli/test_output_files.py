@@ -7,10 +7,8 @@ import shlex
 from pathlib import Path
 
 import pytest
-from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.terminal import typed
 from tests.integration.cli.test_dataset_option import commands
-from tests.integration.message_cases import BDDL
 
 from embomatrix.host.failure import unwritable
 from embomatrix.host.own_files import prepare_output
@@ -77,30 +75,6 @@ QUICK = (
     "factory assets draw --category apple --out OUT",
     "scene import house.json --out OUT",
 )
-
-
-@pytest.fixture(scope="module")
-def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "K"
-    write_kitchen_dataset(folder)
-    return folder
-
-
-@pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Working folder with inputs and a file named `file`."""
-    (tmp_path / "one.bddl").write_text(
-        BDDL.replace("inside apple.n.01_1 counter", "nextto apple.n.01_1 counter")
-    )
-    corners = ((0, 0), (0, 4), (4, 4), (4, 0))
-    floor = ", ".join(f'{{"x": {x}, "z": {z}}}' for x, z in corners)
-    (tmp_path / "house.json").write_text(
-        f'{{"rooms": [{{"id": "room|1", "roomType": "Kitchen", "floorPolygon": [{floor}]}}]}}'
-    )
-    (tmp_path / "file").write_text("a file")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    return tmp_path
 
 
 def run(line: str, kitchen: Path, out: Path) -> tuple[int, str]:

@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.scenes import kitchen_scene
 from tests.integration.cli.test_dataset_option import commands
-from tests.integration.message_cases import BDDL
 
 from embomatrix.bench.report.figures import RESULT_MARK, BenchResult, result_to_json
 from embomatrix.cli.cluster.trace import TRACE_MARK, chrome_trace
@@ -26,7 +24,6 @@ from embomatrix.pages.head import page_head
 from embomatrix.world.dataset import DatasetError
 
 TASK = "apple_to_counter"
-SQUARE = ((0, 0), (0, 4), (4, 4), (4, 0))
 
 
 @dataclass(frozen=True)
@@ -90,32 +87,6 @@ NAMED = {
     *("factory prompts", "eai judge", "bench page", "cluster report", "cluster trace"),
 }
 """Commands whose output is one file that the user names, or, for `cluster`, one with the name of a run."""
-
-
-@pytest.fixture(scope="module")
-def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "K"
-    write_kitchen_dataset(folder)
-    return folder
-
-
-@pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Working folder with inputs, and a home of its own."""
-    (tmp_path / "one.bddl").write_text(
-        BDDL.replace("inside apple.n.01_1 counter", "nextto apple.n.01_1 counter")
-    )
-    (tmp_path / "one.toml").write_text(
-        'instruction = "i"\ngoal = "(open fridge_1)"\n[objects]\nfridge_1 = "inroom kitchen"\n'
-    )
-    room = {"id": "room|1", "roomType": "Kitchen", "floorPolygon": [{"x": x, "z": z} for x, z in SQUARE]}
-    (tmp_path / "house.json").write_text(json.dumps({"rooms": [room]}))
-    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
-    (tmp_path / "good.obj").write_text(f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    monkeypatch.setenv("COLUMNS", "1000")
-    return tmp_path
 
 
 def contents(folder: Path) -> Mapping[str, bytes]:

@@ -4,17 +4,16 @@ import gc
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from embomatrix.bench.trainer.steps import ROWS, LengthScore, Load, policy_of
+from embomatrix.bench.trainer.steps import ROWS, LengthScore, Load, policy_of, step_of
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, TrainSettings, read_settings
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
 from embomatrix.trainer.grpo.learner import Learner
-from embomatrix.trainer.grpo.update import StepPlan, Updater
+from embomatrix.trainer.grpo.update import Updater
 from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.footprint import Footprint, LanguageModelFootprint, Precision
 from embomatrix.trainer.policy.memory_plan import Lengths, Phase, plan_memory
@@ -62,19 +61,7 @@ def plan_error(
     chosen = [tasks[at % len(tasks)] for at in range(settings.grpo.tasks_per_step)]
 
     def take_step(step: int) -> None:
-        updater.take_step(
-            StepPlan(
-                step=step,
-                tasks=chosen,
-                upcoming=(),
-                reserve=(),
-                rng=np.random.default_rng,
-                generator=generator,
-                order=np.random.default_rng,
-                seed_of=lambda *_: 0,
-                rate_factor=1.0,
-            )
-        )
+        updater.take_step(step_of(step, chosen, generator))
 
     take_step(1)
     learner.longest_prompt = learner.longest_plan = 0

@@ -103,22 +103,25 @@ def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
     for step in range(load.unmeasured + load.steps):
         chosen = [tasks[(step * load.tasks + at) % len(tasks)] for at in range(load.tasks)]
         began_s = time.process_time()
-        updater.take_step(
-            StepPlan(
-                step=step,
-                tasks=chosen,
-                upcoming=(),
-                reserve=(),
-                rng=np.random.default_rng,
-                generator=generator,
-                order=np.random.default_rng,
-                seed_of=lambda *_: 0,
-                rate_factor=1.0,
-            )
-        )
+        updater.take_step(step_of(step, chosen, generator))
         spent_s.append(time.process_time() - began_s)
     torch.set_num_threads(threads)
     return spent_s[load.unmeasured :]
+
+
+def step_of(number: int, tasks: Sequence[TrainingTask], generator: torch.Generator) -> StepPlan:
+    """Return a step on these tasks alone, at the full learning rate."""
+    return StepPlan(
+        step=number,
+        tasks=tasks,
+        upcoming=(),
+        reserve=(),
+        rng=np.random.default_rng,
+        generator=generator,
+        order=np.random.default_rng,
+        seed_of=lambda *_: 0,
+        rate_factor=1.0,
+    )
 
 
 def policy_of(load: Load) -> HfPolicy:

@@ -441,7 +441,7 @@ class WordLevelFootprint:
         return max(reading, writing, key=lambda usage: usage.total)
 
     def scored(self, batch: Batch) -> Usage:
-        """At most a pass over all prompts, or what learning keeps of the quarter of the plans that is scored at once."""
+        """Return the larger of a pass over all prompts and what learning keeps of the quarter of the plans scored at once."""
         learnt = self.learnt(batch, entropy=False)
         reading = batch.prompts * batch.prompt * self._per_token
         return Usage(activations=max(reading, learnt.activations // 4), logits=learnt.logits // 4)
