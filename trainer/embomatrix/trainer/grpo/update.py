@@ -277,7 +277,8 @@ class Updater:
         if self._bad_gradients >= MAX_BAD_GRADIENTS:
             raise TrainerError(
                 f"the gradient norm in step {state.plan.step} is {norm}, not finite for the {MAX_BAD_GRADIENTS}th update in a "
-                "row; these updates left the policy unchanged: lower grpo.learning_rate and continue with --resume"
+                "row; these updates left the policy unchanged: start a new run with a lower grpo.learning_rate, from this "
+                "run's folder `reference` (--model) and with --imitate-seconds=0"
             )
 
 
