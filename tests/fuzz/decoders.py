@@ -42,9 +42,7 @@ def forget_inputs() -> None:
 PACKAGED: Final = "a file of this package"
 CHILD: Final = "a process that this program started on the same machine"
 WRITTEN: Final = "a value that this process made, or a file that this program has just written"
-LIBRARY: Final = (
-    "a model file that its library reads; test_hf_policy, test_lora and test_model read damaged ones"
-)
+LIBRARY: Final = "a model file that its library reads; test_hf_policy, test_lora, test_memory and test_model read damaged ones"
 BENCH: Final = "a benchmark's own files, and messages that its attackers receive"
 DEVELOPER: Final = "a tool that rebuilds the catalog from packages that a developer installed"
 
@@ -128,5 +126,6 @@ OWN: Final[Mapping[str, str]] = {
     "trainer.policy.import_gguf:_unpack": LIBRARY,
     "trainer.policy.import_gguf:import_gguf": LIBRARY,
     "trainer.policy.lora:load_adapters": LIBRARY,
+    "trainer.policy.model_shape:language_model_shape": LIBRARY,
 }
 """Functions with a parsing call that read no foreign bytes, and what they read."""

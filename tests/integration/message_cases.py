@@ -634,6 +634,12 @@ COMMANDS = (
         "lower it, or raise grpo.tasks_per_step",
     ),
     CommandCase(
+        "data-parallel processes on a GPU",
+        "train --device=cuda --processes=2 --dataset=KITCHEN --out=FILES/new",
+        "expected cpu with processes = 2",
+        "set processes to 1, or leave the device out",
+    ),
+    CommandCase(
         "truncated importance sampling on fresh plans",
         "train --settings=FILES/truncate.toml --dataset=KITCHEN --out=FILES/new",
         "expected grpo.overlap = 'ahead'",

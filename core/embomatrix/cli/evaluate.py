@@ -108,7 +108,7 @@ class EvalSettings(BaseModel):
     threads: int | None = Field(None, ge=1)
     """torch threads."""
     device: str = "cpu"
-    """torch device of a policy in this process."""
+    """torch device of a local model: cpu or cuda."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ def evaluate(
 add_settings(
     evaluate,
     EvalSettings,
-    skip=("concurrent", "attempts", "device"),
+    skip=("concurrent", "attempts"),
     panel="Settings (also in the file of --settings)",
 )
 

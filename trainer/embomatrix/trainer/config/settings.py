@@ -342,6 +342,17 @@ class TrainSettings(_Frozen):
     reward: RewardTable = RewardTable()
     evaluation: EvaluationSettings = EvaluationSettings()
 
+    @field_validator("device")
+    @classmethod
+    def _check_device(cls, value: str, info: ValidationInfo) -> str:
+        processes = info.data.get("processes", 1)
+        if processes > 1 and value != "cpu":
+            raise ValueError(
+                f"expected cpu with processes = {processes}, which share the weights in its memory: set processes to 1, or "
+                "leave the device out"
+            )
+        return value
+
 
 LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "prompt.rename_share": 0.0,

@@ -190,17 +190,9 @@ class DataParallelWorkers:
 
     @classmethod
     def start(cls, local: Learner, policy: Policy, settings: TrainSettings, reference: Path) -> Self:
-        """Start ``settings.processes - 1`` remote learners. ``reference`` is the reference policy's folder.
-
-        Raises TrainerError if several processes are requested and the policy is not on the CPU.
-        """
+        """Start ``settings.processes - 1`` remote learners, on the CPU. ``reference`` is the reference policy's folder."""
         if settings.processes == 1:
             return cls(local)
-        if settings.device != "cpu":
-            raise TrainerError(
-                f"processes = {settings.processes} needs a policy on the CPU, but the device is {settings.device}: pass "
-                "--processes=1"
-            )
         learning = list(policy.parameters())
         weights = SharedTensors([parameter.data for parameter in learning])
         for parameter, shared in zip(learning, weights.tensors, strict=True):
