@@ -123,14 +123,6 @@ def test_error_in_a_remote_process_is_reported(tmp_path, monkeypatch):
             asked.result(timeout=60)
 
 
-def test_several_processes_need_a_policy_on_the_cpu(tmp_path):
-    settings = read_settings(None, {"processes": 2})
-    policy = new_policy(settings, TASKS)
-    elsewhere = settings.model_copy(update={"device": "cuda"})
-    with pytest.raises(TrainerError, match=r"processes = 2 .* the device is cuda: pass --processes=1"):
-        DataParallelWorkers.start(Learner(policy, policy, settings.grpo), policy, elsewhere, tmp_path)
-
-
 def test_shared_tensors_are_visible_on_both_sides():
     like = [torch.zeros(3, 5), torch.zeros((), dtype=torch.float64), torch.zeros(7, dtype=torch.bfloat16)]
     ours = SharedTensors(like)

@@ -41,6 +41,10 @@ def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
             "[grpo]\noverlap = 'ahead'\ntruncate_ratio = 0.5",
             r"'grpo\.truncate_ratio': .* equal to 1 \(found 0\.5\)",
         ),
+        (
+            "device = 'cuda'\nprocesses = 2",
+            r"'device': expected cpu with processes = 2, .*: set processes to 1, or leave the device out",
+        ),
         ("[reward]\ngaol = 3", r"unknown setting 'reward\.gaol': correct its name"),
         ("[reward]\ngoal = -3", r"setting 'reward': .*goal: found -3: expected 0 or more"),
         ("[reward]\ngoal = 'much'", r"setting 'reward\.goal': input should be a valid number"),
