@@ -89,16 +89,15 @@ def furnish_cutaway(stage: VisualScene) -> None:
     """Fill a stage for oblique pictures: no ceiling objects, near walls cut low and without the pictures on them."""
     scene = stage.scene
     low_walls = [wall.aabb(IDENTITY) for wall in scene.walls if _hides(scene, wall)]
+
+    def is_shown(item: SceneObject) -> bool:
+        hangs_on_wall = item.fixed and not item.host
+        floats = hangs_on_wall and _would_float(scene.box_of(item.name), low_walls)
+        return not (floats or _hangs_at_ceiling(scene, item))
+
     stage.add_floors()
     stage.add_walls(lambda wall: _cut(scene, wall))
-    stage.add_objects(
-        lambda item: (
-            not (
-                _hangs_at_ceiling(scene, item)
-                or (item.fixed and not item.host and _would_float(scene.box_of(item.name), low_walls))
-            )
-        )
-    )
+    stage.add_objects(is_shown)
     stage.add_background(lambda item, box: bool(item.host) or not _would_float(box, low_walls))
 
 
