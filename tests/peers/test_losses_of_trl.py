@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, RatioLevel
-from embomatrix.trainer.grpo.objective import (
+from embomatrix.trainer.learning.objective import (
     LossInputs,
     LossTotals,
     group_advantages,

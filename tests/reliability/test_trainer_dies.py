@@ -16,7 +16,7 @@ from tests.fakes.real_cluster import (
 from tests.fakes.simulation import graded_total
 
 from embomatrix.rpc.wire.values import Completed
-from embomatrix.trainer.grpo.objective import group_advantages
+from embomatrix.trainer.learning.objective import group_advantages
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 

@@ -12,12 +12,13 @@ from tests.integration.trainer.test_loop import SEVERAL_UPDATES, TASKS, run, wei
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, SharedTensors
-from embomatrix.trainer.grpo.learner import Learner
-from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner, SharedTensors
+from embomatrix.trainer.learning.gradient import GradientSum
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.policy.loading import new_policy
+from embomatrix.trainer.run.starting import RunStart
 
 FAST = {"imitation__steps": 20, "grpo__steps": 4, "checkpoint_every": 2}
 
@@ -44,7 +45,7 @@ def learnt(folder, **changes):
     "changes",
     [
         {},
-        {"grpo__chunk": 1},
+        {"grpo__chunk": 1, "imitation__chunk": 5},
         {"grpo__chunk": 1, "grpo__reserve": 4, "grpo__overlap": "ahead"},
         {"grpo__chunk": 1, "grpo__updates_per_batch": 2},
         {**SEVERAL_UPDATES, "grpo__reserve": 4, "grpo__overlap": "ahead", "grpo__truncate_ratio": 2.0},
@@ -111,13 +112,40 @@ def test_ctrl_c_waits_for_neither_rewards_nor_processes(tmp_path, remotes, inter
     assert CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest().name == "step-000002"
 
 
-def test_error_in_a_remote_process_is_reported(tmp_path, monkeypatch):
+def test_a_batch_of_imitation_is_shared_and_its_gradient_is_that_of_the_whole(monkeypatch):
+    settings = read_settings(None, {})
+    policy = new_policy(settings, TASKS)
+    examples = [
+        RunStart(settings, TASKS, policy, TrainingProgress("")).prompt_builder.plain_example(task)
+        for task in TASKS.train
+    ]
+    asked = []
+    real = RemoteLearner.imitate
+
+    def noted(self, examples, tokens):
+        asked.append(len(examples))
+        return real(self, examples, tokens)
+
+    monkeypatch.setattr(RemoteLearner, "imitate", noted)
+
+    def gradient(processes, size):
+        changed = settings.model_copy(update={"processes": processes})
+        with DataParallelWorkers.start(policy, changed) as workers:
+            loss = GradientSum(policy, workers).imitate(examples, size)
+        return loss, [parameter.grad.clone() for parameter in policy.parameters()]
+
+    whole, one, two = gradient(1, len(examples)), gradient(1, 3), gradient(2, 3)
+    assert asked == [3, 1]  # the second and the fourth part of ten examples
+    assert two[0] == one[0] == pytest.approx(whole[0], rel=1e-5)
+    for shared, alone, undivided in zip(two[1], one[1], whole[1], strict=True):
+        assert torch.equal(shared, alone)
+        torch.testing.assert_close(shared, undivided, rtol=1e-3, atol=1e-5)
+
+
+def test_error_in_a_remote_process_is_reported():
     settings = read_settings(None, {"processes": 2})
     policy = new_policy(settings, TASKS)
-    policy.save(tmp_path)
-    with DataParallelWorkers.start(
-        Learner(policy, policy, settings.grpo), policy, settings, tmp_path
-    ) as workers:
+    with DataParallelWorkers.start(policy, settings) as workers:
         asked = workers.remote(1).run(lambda remote: remote.sample([(1, 2, 10**9)], 0))
         with pytest.raises(TrainerError, match=r"trainer-1 failed \(IndexError.*continue with --resume"):
             asked.result(timeout=60)

@@ -13,6 +13,7 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.imitation.optimiser import ImitationOptimiser
 from embomatrix.trainer.imitation.teacher_forcing import Imitation
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.logging.display import LineDisplay, LiveDisplay
 from embomatrix.trainer.logging.recorder import IMITATION, Recorder
@@ -55,7 +56,8 @@ def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
         if cut_after == step.step:
             raise CutError
 
-    run_imitation(RunStart(settings, tasks, policy, progress), out, Recorder(out), report)
+    with DataParallelWorkers.start(policy, settings) as workers:
+        run_imitation(RunStart(settings, tasks, policy, progress), workers, out, Recorder(out), report)
     return policy, progress.imitation, steps
 
 

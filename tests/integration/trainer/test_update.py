@@ -9,7 +9,7 @@ from tests.integration.trainer.test_loop import run, weights
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import Overlap
-from embomatrix.trainer.grpo.objective import LossKind
+from embomatrix.trainer.learning.objective import LossKind
 from embomatrix.trainer.logging.recorder import read_metrics
 
 TASKS = make_tasks(10, 0, objects=10)

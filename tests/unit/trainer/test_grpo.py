@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, RatioLevel
-from embomatrix.trainer.grpo.objective import (
+from embomatrix.trainer.learning.objective import (
     LossInputs,
     LossTotals,
     group_advantages,

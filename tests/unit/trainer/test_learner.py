@@ -5,8 +5,8 @@ from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.config.settings import GrpoSettings
-from embomatrix.trainer.grpo.learner import Learner, Microbatch
-from embomatrix.trainer.grpo.objective import LossTotals
+from embomatrix.trainer.learning.learner import Learner, Microbatch
+from embomatrix.trainer.learning.objective import LossTotals
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import build_vocabulary

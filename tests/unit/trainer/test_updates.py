@@ -20,9 +20,9 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, Overlong
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.batch import minibatches_of
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
-from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
+from embomatrix.trainer.learning.learner import Learner
 from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.policy.decoder import DecoderShape

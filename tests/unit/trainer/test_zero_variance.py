@@ -11,9 +11,9 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.trainer.cluster.gateway import PlanOutcome
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, GrpoSettings, OnLost, read_settings
 from embomatrix.trainer.data.variation import Variation
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
-from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
+from embomatrix.trainer.learning.learner import Learner
 from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.prompts import PromptBuilder

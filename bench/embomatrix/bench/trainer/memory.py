@@ -11,9 +11,9 @@ from embomatrix.bench.trainer.steps import ROWS, LengthScore, Load, policy_of, s
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, TrainSettings, read_settings
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.data.variation import Variation
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
-from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import Updater
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
+from embomatrix.trainer.learning.learner import Learner, SamplingRule
 from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.footprint import Footprint, LanguageModelFootprint, Precision
 from embomatrix.trainer.policy.memory_plan import Lengths, Phase, plan_memory
@@ -31,8 +31,8 @@ class _LongPlanLearner(Learner):
     longest_prompt = 0
     longest_plan = 0
 
-    def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
-        drawn = super().sample(prompts, seed)
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule | None = None) -> Samples:
+        drawn = super().sample(prompts, seed, rule)
         self.longest_prompt = max(self.longest_prompt, *map(len, prompts))
         self.longest_plan = max(self.longest_plan, drawn.tokens.shape[1])
         longest = int(drawn.mask.sum(dim=1).argmax())

@@ -26,9 +26,9 @@ from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome
 from embomatrix.trainer.config.settings import GrpoSettings
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.data.variation import Variation
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
-from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.update import StepPlan, Updater
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
+from embomatrix.trainer.learning.learner import Learner
 from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.prompts import PromptBuilder

@@ -166,6 +166,7 @@ def imitate(
     seed: _SEED = None,
     settings_file: _SETTINGS = None,
     threads: _THREADS = None,
+    processes: _PROCESSES = None,
     device: _DEVICE = None,
     track: _TRACK = None,
 ) -> None:
@@ -178,6 +179,7 @@ def imitate(
             "seed": seed,
             "device": device,
             "threads": threads,
+            "processes": processes,
             "imitation.seconds": seconds,
             "imitation.steps": steps,
             "imitation.patience": patience,
@@ -273,6 +275,7 @@ def _traffic_log(path: Path | None) -> Iterator[Callable[[Batch], None]]:
 
 
 def _imitated(start: RunStart, out: Path) -> ImitationState:
+    from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
     from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
     from embomatrix.trainer.logging.display import display_on
     from embomatrix.trainer.logging.recorder import Recorder
@@ -287,8 +290,12 @@ def _imitated(start: RunStart, out: Path) -> ImitationState:
             f"imitation of the run in {out} is finished: continue with `embomatrix train --resume`"
         )
     clock = imitation_clock(start, began_s=time.monotonic())
-    with trackers_of(start.settings, out) as trackers, display_on(Console(), clock) as display:
-        run_imitation(start, out, Recorder(out, trackers), display.imitation)
+    with (
+        trackers_of(start.settings, out) as trackers,
+        display_on(Console(), clock) as display,
+        DataParallelWorkers.start(start.policy, start.settings) as workers,
+    ):
+        run_imitation(start, workers, out, Recorder(out, trackers), display.imitation)
     with atomic_folder(out / REFERENCE) as folder:
         start.policy.save(folder)
     return progress.imitation

@@ -151,8 +151,10 @@ class ImitationSettings(_Frozen):
     """Number of steps. Overrides ``seconds``."""
     batch: int = Field(default=32, ge=1)
     """Plans per step."""
-    chunk: int | None = Field(default=None, ge=1)
-    """Plans per forward pass. Gradients accumulate over chunks, which bounds memory. None: the whole batch."""
+    chunk: int | None = Field(default=16, ge=1)
+    """Plans per forward pass, the microbatches of a step. Gradients accumulate over them, which bounds memory. None: the whole
+    batch.
+    """
     optimiser: OptimiserKind = OptimiserKind.MUON
     learning_rate: float = Field(default=2e-3, gt=0)
     """Learning rate of AdamW."""
@@ -320,7 +322,7 @@ class TrainSettings(_Frozen):
     threads: int = Field(default=1, ge=1)
     """Torch threads per process."""
     processes: int = Field(default=1, ge=1)
-    """Data-parallel processes for GRPO, on a CPU. The result is bit-identical for any number.
+    """Data-parallel processes on a CPU. The result is bit-identical for any number.
 
     Processes beyond the number of microbatches of a step stay idle.
     """

@@ -5,12 +5,13 @@ Samples of one task are not independent, so intervals come from a bootstrap over
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-import torch
+import numpy as np
 
 from embomatrix.pages.figures import Interval
 from embomatrix.skills.parse import PlanError
@@ -27,11 +28,12 @@ from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
 from embomatrix.trainer.evaluation.answers import Answer
 from embomatrix.trainer.evaluation.intervals import mean_over_tasks, paired_difference
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
+from embomatrix.trainer.learning.learner import Learner, SamplingRule
 from embomatrix.trainer.policy.prompts import PromptBuilder
-from embomatrix.trainer.policy.protocol import Policy
 
 if TYPE_CHECKING:
     from embomatrix.trainer.config.settings import EvaluationSettings
+    from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +90,11 @@ def improvement(before: HeldOutEvaluation, after: HeldOutEvaluation) -> Interval
     return paired_difference(earlier, later)
 
 
+_Pending = tuple[PlanGroup, Future[tuple[PlanOutcome, ...]]]
+
+
 def evaluate_policy(
-    policy: Policy,
+    workers: DataParallelWorkers,
     prompt_builder: PromptBuilder,
     tasks: Sequence[TrainingTask],
     gateway: Gateway,
@@ -101,16 +106,19 @@ def evaluate_policy(
     label: str,
     report: Callable[[int, int], None],
 ) -> HeldOutEvaluation:
-    """Sample plans of each task and execute each once. ``report`` gets finished and total tasks."""
-    device = next(iter(policy.parameters())).device
-    generator = torch.Generator(device).manual_seed(seed)
+    """Sample plans of each task and execute each once. ``report`` gets finished and total tasks.
+
+    A chunk of tasks has its own seed, so its plans are the same in whichever process they are sampled.
+    """
+    codec, rule = workers.local.policy.codec, SamplingRule(samples, settings.temperature, max_new)
     chunks = [tasks[at : at + settings.chunk] for at in range(0, len(tasks), settings.chunk)]
     gateway.announce(dict(enumerate(chunks)), samples)
-    pending: list[tuple[PlanGroup, Future[tuple[PlanOutcome, ...]]]] = []
-    for number, chunk in enumerate(chunks):
+
+    def sample(
+        number: int, chunk: Sequence[TrainingTask], learner: Learner | RemoteLearner
+    ) -> list[_Pending]:
         prompts = [prompt_builder.plain(task) for task in chunk]
-        tokens = [prompt.tokens for prompt in prompts]
-        drawn = policy.sample(tokens, samples, settings.temperature, max_new, generator)
+        drawn = learner.sample([prompt.tokens for prompt in prompts], _seed_of(seed, number), rule)
         groups = [
             PlanGroup(
                 task,
@@ -120,15 +128,23 @@ def evaluate_policy(
             )
             for row, (task, prompt) in enumerate(zip(chunk, prompts, strict=True))
         ]
-        pending += zip(groups, gateway.submit(f"{label}-{number}", number, groups, policy.codec), strict=True)
+        return list(zip(groups, gateway.submit(f"{label}-{number}", number, groups, codec), strict=True))
+
+    jobs = [(number, functools.partial(sample, number, chunk)) for number, chunk in enumerate(chunks)]
+    pending = [each for sampled in workers.map(jobs) for each in sampled]
     scores: list[TaskScore] = []
     answers: list[HeldOutAnswer] = []
     for group, future in pending:
         outcomes: tuple[PlanOutcome, ...] = result_of(future)
         scores.append(_task_score(group.task, outcomes))
-        answers += [_answer(group, policy.codec, sample, outcome) for sample, outcome in enumerate(outcomes)]
+        answers += [_answer(group, codec, sample, outcome) for sample, outcome in enumerate(outcomes)]
         report(len(scores), len(tasks))
     return HeldOutEvaluation(tuple(scores), tuple(answers))
+
+
+def _seed_of(seed: int, chunk: int) -> int:
+    """Return the seed of a chunk's plans."""
+    return int(np.random.SeedSequence((seed, chunk)).generate_state(1)[0])
 
 
 def _answer(group: PlanGroup, codec: Codec, sample: int, outcome: PlanOutcome) -> HeldOutAnswer:

@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, OnLost
-from embomatrix.trainer.grpo.learner import Microbatch
-from embomatrix.trainer.grpo.objective import LossTotals, group_advantages
 from embomatrix.trainer.grpo.records import GroupLog
+from embomatrix.trainer.learning.learner import Microbatch
+from embomatrix.trainer.learning.objective import LossTotals, group_advantages
 from embomatrix.trainer.policy.protocol import Tokens
 
 if TYPE_CHECKING:

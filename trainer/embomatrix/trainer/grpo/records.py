@@ -11,7 +11,7 @@ from embomatrix.rpc.wire.values import Completed
 if TYPE_CHECKING:
     from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.trainer.grpo.objective import LossMetrics
+    from embomatrix.trainer.learning.objective import LossMetrics
 
 
 @dataclass(frozen=True, slots=True)

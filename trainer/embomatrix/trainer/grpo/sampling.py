@@ -20,8 +20,8 @@ from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
 
 if TYPE_CHECKING:
-    from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
-    from embomatrix.trainer.grpo.learner import Learner
+    from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
+    from embomatrix.trainer.learning.learner import Learner
 
 _SEEDS: Final = 2**62
 

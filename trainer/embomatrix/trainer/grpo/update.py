@@ -34,12 +34,12 @@ from embomatrix.trainer.grpo.batch import (
     minibatches_of,
     scored_groups,
 )
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
-from embomatrix.trainer.grpo.gradient import Gradient, GradientSum
-from embomatrix.trainer.grpo.learner import Learner
-from embomatrix.trainer.grpo.objective import LossMetrics, LossTotals, loss_divisor
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord, record_of
 from embomatrix.trainer.grpo.sampling import SampledChunk, Sampler
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
+from embomatrix.trainer.learning.gradient import Gradient, GradientSum
+from embomatrix.trainer.learning.learner import Learner
+from embomatrix.trainer.learning.objective import LossMetrics, LossTotals, loss_divisor
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.policy.prompts import PromptBuilder

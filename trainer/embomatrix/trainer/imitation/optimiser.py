@@ -1,8 +1,4 @@
-"""Optimiser of imitation: AdamW, or Muon for the matrices of linear layers with AdamW for all other parameters.
-
-Muon (Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks") replaces a matrix's momentum by the
-nearest matrix whose singular values are all 1, so rare directions learn as fast as frequent ones.
-"""
+"""Optimiser of imitation: AdamW, or Muon for the matrices of linear layers with AdamW for all other parameters."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,12 +8,13 @@ from torch import nn
 from torch.optim import Optimizer
 
 from embomatrix.trainer.config.settings import ImitationSettings, OptimiserKind
+from embomatrix.trainer.imitation.muon import Muon
 
 _BETAS = (0.9, 0.95)
 
 
 class ImitationOptimiser:
-    """One or two torch optimisers behind one interface, each with its own learning rate."""
+    """One or two optimisers behind one interface, each with its own learning rate."""
 
     def __init__(self, module: nn.Module, settings: ImitationSettings) -> None:
         matrices = _matrices(module) if settings.optimiser is OptimiserKind.MUON else []
@@ -32,11 +29,7 @@ class ImitationOptimiser:
         }
         if matrices:
             rate = settings.matrix_learning_rate
-            self._parts["muon"] = (torch.optim.Muon(matrices, lr=rate, weight_decay=decay), rate)
-
-    def zero_grad(self) -> None:
-        for optimiser, _ in self._parts.values():
-            optimiser.zero_grad(set_to_none=True)
+            self._parts["muon"] = (Muon(matrices, lr=rate, weight_decay=decay), rate)
 
     def step(self, factor: float) -> None:
         """Update the weights. ``factor`` scales all learning rates."""

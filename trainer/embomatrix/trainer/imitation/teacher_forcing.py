@@ -15,21 +15,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import ImitationSettings
 from embomatrix.trainer.imitation.optimiser import ImitationOptimiser
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
+from embomatrix.trainer.learning.gradient import GradientSum
+from embomatrix.trainer.learning.likelihood import negative_log_likelihood, plan_tokens
 from embomatrix.trainer.lifecycle.checkpoint import ImitationState
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.policy.prompts import PromptBuilder
-from embomatrix.trainer.policy.protocol import Policy, Tokens
+from embomatrix.trainer.policy.protocol import Policy
 
 if TYPE_CHECKING:
     from embomatrix.trainer.data.tasks import TrainingTask
-
-
-Example = tuple[Tokens, Tokens]  # prompt and plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +48,13 @@ class Imitation:
     """Imitation phase of one run. Raises TrainerError if no task has an oracle plan, unless the budget is 0.
 
     The learning rate warms up linearly and then follows a cosine over the budget. Prompts are varied anew in every step.
+    ``policy`` is the policy of the data-parallel workers.
     """
 
     def __init__(
         self,
         policy: Policy,
+        workers: DataParallelWorkers,
         prompt_builder: PromptBuilder,
         tasks: Sequence[TrainingTask],
         settings: ImitationSettings,
@@ -67,6 +68,7 @@ class Imitation:
         self._settings = settings
         self._seed = seed
         self._training, self._validation = _split_tasks(tasks, settings, seed)
+        self._gradient = GradientSum(policy, workers)
         self._optimiser = ImitationOptimiser(policy.module, settings)
         self._best: dict[str, Tensor] = {}
 
@@ -130,25 +132,11 @@ class Imitation:
         rng = np.random.default_rng(np.random.SeedSequence((self._seed, 1, self.state.step)))
         chosen = rng.integers(len(self._training), size=settings.batch)
         examples = [self._prompt_builder.example(self._training[int(at)], rng) for at in chosen]
-        self._optimiser.zero_grad()
-        loss = self._learn(examples)
+        loss = self._gradient.imitate(examples, settings.chunk or len(examples))
         torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
         interrupts.defer()
         self._optimiser.step(_rate_factor(share, self.state.step, settings.warmup_steps))
         return loss
-
-    def _learn(self, examples: Sequence[Example]) -> float:
-        """Accumulate the gradient of the mean loss per plan token over chunks, and return the loss.
-
-        Memory is bounded by one chunk.
-        """
-        tokens, size = _plan_tokens(examples), self._settings.chunk or len(examples)
-        total = 0.0
-        for at in range(0, len(examples), size):
-            loss = _total_loss(self._policy, examples[at : at + size]) / tokens
-            torch.autograd.backward(loss)
-            total += float(loss.detach())
-        return total
 
     def _validate(self) -> float:
         """Evaluate the validation loss, and keep the weights if it is the lowest so far."""
@@ -167,10 +155,10 @@ class Imitation:
         batch = self._settings.batch
         examples = [self._prompt_builder.plain_example(task) for task in self._validation]
         total = sum(
-            float(_total_loss(self._policy, examples[at : at + batch]))
+            float(negative_log_likelihood(self._policy, examples[at : at + batch]))
             for at in range(0, len(examples), batch)
         )
-        return total / _plan_tokens(examples)
+        return total / plan_tokens(examples)
 
 
 def _split_tasks(
@@ -200,18 +188,3 @@ def _rate_factor(share: float, step: int, warmup: int) -> float:
     """Factor of the learning rate: linear warm-up, then half a cosine down to a twentieth."""
     rise = min(1.0, (step + 1) / (warmup + 1))
     return rise * (0.05 + 0.95 * (1 + math.cos(math.pi * min(1.0, share))) / 2)
-
-
-def _plan_tokens(examples: Sequence[Example]) -> int:
-    """Number of plan tokens in the examples."""
-    return sum(len(plan) for _, plan in examples)
-
-
-def _total_loss(policy: Policy, examples: Sequence[Example]) -> Tensor:
-    """Negative log-likelihood of the plans, summed over their tokens."""
-    prompts, plans = zip(*examples, strict=True)
-    tokens = pad_sequence([torch.tensor(plan) for plan in plans], batch_first=True)
-    mask = pad_sequence([torch.ones(len(plan), dtype=torch.bool) for plan in plans], batch_first=True)
-    device = next(iter(policy.parameters())).device
-    scored = policy.logprobs(prompts, tokens.to(device), mask.to(device), group=1, temperature=1.0)
-    return -scored.logprobs.sum()

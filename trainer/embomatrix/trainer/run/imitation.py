@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from embomatrix.trainer.imitation.teacher_forcing import Imitation, ImitationProgress
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, restore
 from embomatrix.trainer.logging.recorder import IMITATION, Recorder
 from embomatrix.trainer.run.starting import RunStart
@@ -17,14 +18,24 @@ LOG_EVERY: Final = 10
 
 
 def run_imitation(
-    start: RunStart, out: Path, recorder: Recorder, report: Callable[[ImitationProgress], None]
+    start: RunStart,
+    workers: DataParallelWorkers,
+    out: Path,
+    recorder: Recorder,
+    report: Callable[[ImitationProgress], None],
 ) -> None:
     """Use up the imitation budget and keep the progress current. A checkpoint is always left. Raises TrainerError."""
     policy, progress, settings = start.policy, start.progress, start.settings
     store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
     state = progress.imitation
     imitation = Imitation(
-        policy, start.prompt_builder, start.tasks.train, settings.imitation, seed=settings.seed, state=state
+        policy,
+        workers,
+        start.prompt_builder,
+        start.tasks.train,
+        settings.imitation,
+        seed=settings.seed,
+        state=state,
     )
     if state.done:
         return

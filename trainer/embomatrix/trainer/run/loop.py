@@ -18,10 +18,9 @@ from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.settings import SeedPer
 from embomatrix.trainer.data.tasks import Curriculum, Schedule, training_seed
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers
-from embomatrix.trainer.grpo.learner import Learner
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord
 from embomatrix.trainer.grpo.update import StepPlan, Updater
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, atomic_folder, restore
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
@@ -72,59 +71,59 @@ class TrainingRun:
         """Run all phases. Ctrl-C saves a checkpoint for ``--resume`` and is raised again."""
         began_s = time.monotonic()
         earlier_s = sum(self._progress.spent_s.values())
-        reference = self._start.reference or self._prepare()
-        checkpoint = self._grpo(reference)
-        after = self._evaluate(AFTER, self._settings.evaluation.samples)
+        with DataParallelWorkers.start(self._start.policy, self._settings) as workers:
+            reference = self._start.reference or self._prepare(workers)
+            workers.use_reference(reference, self._out / REFERENCE)
+            checkpoint = self._grpo(workers)
+            after = self._evaluate(AFTER, self._settings.evaluation.samples, workers)
         summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
         source = TrainedOn(self._start.tasks, self._progress.dataset, self._settings.seed)
         write_report(summary, source, read_metrics(self._out), read_evaluations(self._out))
         write_outcome(self._out, summary.outcome)
         return summary
 
-    def _grpo(self, reference: Policy) -> Path:
+    def _grpo(self, workers: DataParallelWorkers) -> Path:
         """Run GRPO on all data-parallel workers. Return the last checkpoint."""
-        policy, settings = self._start.policy, self._settings
-        local = Learner(policy, reference, settings.grpo)
-        with DataParallelWorkers.start(local, policy, settings, self._out / REFERENCE) as workers:
-            updater = Updater(
-                policy, workers, self._start.prompt_builder, self._gateway, settings.grpo, self._stopwatch
-            )
-            newest = self._store.latest() if self._resumed else None
-            if newest is not None:
-                restore(newest, functools.partial(self._load_tensors, updater))
-            self._recorder.forget_after(self._progress.step, METRICS, SAMPLES, EVALUATIONS)
-            try:
-                self._optimise(updater)
-            except BaseException:
-                # A step that was taken by half can't be resumed: the checkpoint before it stays the newest.
-                if not updater.is_between_updates:
-                    self._save(updater)
-                raise
-            return self._save(updater)
+        start, settings = self._start, self._settings
+        updater = Updater(
+            start.policy, workers, start.prompt_builder, self._gateway, settings.grpo, self._stopwatch
+        )
+        newest = self._store.latest() if self._resumed else None
+        if newest is not None:
+            restore(newest, functools.partial(self._load_tensors, updater))
+        self._recorder.forget_after(self._progress.step, METRICS, SAMPLES, EVALUATIONS)
+        try:
+            self._optimise(updater, workers)
+        except BaseException:
+            # A step that was taken by half can't be resumed: the checkpoint before it stays the newest.
+            if not updater.is_between_updates:
+                self._save(updater)
+            raise
+        return self._save(updater)
 
     def _load_tensors(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])
         self._generator.set_state(tensors["generator"])
 
-    def _prepare(self) -> Policy:
+    def _prepare(self, workers: DataParallelWorkers) -> Policy:
         """Run imitation and the first evaluation. Return the reference policy, a copy of the policy."""
         policy, progress = self._start.policy, self._progress
         with self._stopwatch.track(Activity.IMITATION):
-            run_imitation(self._start, self._out, self._recorder, self._display.imitation)
-        before = self._evaluate(BEFORE, self._settings.evaluation.samples)
+            run_imitation(self._start, workers, self._out, self._recorder, self._display.imitation)
+        before = self._evaluate(BEFORE, self._settings.evaluation.samples, workers)
         progress.before = before.as_json() if before else []
         with atomic_folder(self._out / REFERENCE) as folder:
             policy.save(folder)
         progress.grpo_ready = True
         return policy.frozen_copy()
 
-    def _evaluate(self, label: str, samples: int) -> HeldOutEvaluation | None:
+    def _evaluate(self, label: str, samples: int, workers: DataParallelWorkers) -> HeldOutEvaluation | None:
         start, settings, step = self._start, self._settings, self._progress.step
         if not start.tasks.heldout:
             return None
         with self._stopwatch.track(Activity.EVALUATION):
             result = evaluate_policy(
-                start.policy,
+                workers,
                 start.prompt_builder,
                 start.tasks.heldout,
                 self._gateway,
@@ -139,14 +138,14 @@ class TrainingRun:
         self._recorder.evaluation(step, label, result)
         return result
 
-    def _evaluate_if_due(self, done: set[int]) -> None:
+    def _evaluate_if_due(self, done: set[int], workers: DataParallelWorkers) -> None:
         """Evaluate after every so many steps. ``done`` are the steps with an evaluation; a resumed run repeats none."""
         settings, step = self._settings.evaluation, self._progress.step
         if settings.every and step and step % settings.every == 0 and step not in done:
-            self._evaluate(DURING, settings.samples_during)
+            self._evaluate(DURING, settings.samples_during, workers)
             done.add(step)
 
-    def _optimise(self, updater: Updater) -> None:
+    def _optimise(self, updater: Updater, workers: DataParallelWorkers) -> None:
         settings = self._settings.grpo
         progress = self._progress
         tasks, seed = self._start.tasks.train, self._settings.seed
@@ -155,7 +154,7 @@ class TrainingRun:
         reserve = Schedule(tasks, seed=seed, cursor=progress.reserve_cursor, stream=RESERVE_STREAM)
         evaluated = {each.step for each in read_evaluations(self._out)}
         while (share := self._share()) < 1.0:
-            self._evaluate_if_due(evaluated)
+            self._evaluate_if_due(evaluated, workers)
             began_s = time.monotonic()
             self._announce(schedule, reserve, progress.step)
             with DeferredInterrupts() as interrupts:

@@ -1,4 +1,4 @@
-"""Data-parallel workers: processes that sample and back-propagate GRPO's microbatches side by side.
+"""Data-parallel workers: processes that sample and back-propagate microbatches side by side, in imitation and GRPO.
 
 Microbatch ``n`` of a step belongs to process ``n`` modulo the number of processes. Process 0 is the trainer itself.
 All processes see the same weights in shared memory.
@@ -6,12 +6,15 @@ All processes see the same weights in shared memory.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import mmap
 import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import DupFd
@@ -24,8 +27,9 @@ from torch import Tensor
 from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
-from embomatrix.trainer.grpo.learner import Learner, Microbatch
-from embomatrix.trainer.grpo.objective import LossMetrics
+from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingRule
+from embomatrix.trainer.learning.likelihood import Example
+from embomatrix.trainer.learning.objective import LossMetrics
 from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
@@ -60,7 +64,7 @@ class SharedTensors:
 class RemoteLearner:
     """Learner in another process. Its requests are executed one after the other."""
 
-    def __init__(self, number: int, settings: TrainSettings, reference: Path, weights: SharedTensors) -> None:
+    def __init__(self, number: int, settings: TrainSettings, folder: Path, weights: SharedTensors) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._gradient = SharedTensors(weights.tensors)
         self._connection, remote_end = spawn.Pipe()
@@ -68,7 +72,7 @@ class RemoteLearner:
         memory = (DupFd(weights.fd), DupFd(self._gradient.fd))
         self._process = spawn.Process(
             target=_serve,
-            args=(remote_end, settings.model_dump(mode="json"), reference, *memory),
+            args=(remote_end, settings.model_dump(mode="json"), folder, *memory),
             name=self._name,
             daemon=True,
         )
@@ -82,8 +86,12 @@ class RemoteLearner:
         """Queue ``job`` on this learner's thread. The job must not wait for other jobs, or Ctrl-C would wait too."""
         return self._thread.submit(job, self)
 
-    def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
-        samples: Samples = self._request("sample", tuple(prompts), seed)
+    def use_reference(self, folder: Path) -> None:
+        """Load the reference policy, which GRPO needs."""
+        self._request("use_reference", folder)
+
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule | None = None) -> Samples:
+        samples: Samples = self._request("sample", tuple(prompts), seed, rule)
         return samples
 
     def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
@@ -97,10 +105,17 @@ class RemoteLearner:
     def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[Tensor | None]]:
         """Return the metrics of a microbatch, and its gradient by parameter."""
         metrics, has_gradient = self._request("learn", microbatch)
+        return metrics, self._gradients(has_gradient)
+
+    def imitate(self, examples: Sequence[Example], tokens: int) -> tuple[float, list[Tensor | None]]:
+        """Return the loss of the examples, and its gradient by parameter."""
+        loss, has_gradient = self._request("imitate", tuple(examples), tokens)
+        return loss, self._gradients(has_gradient)
+
+    def _gradients(self, present: Sequence[bool]) -> list[Tensor | None]:
+        """Copy the gradient that the process has written to shared memory."""
         shared = self._gradient.tensors
-        return metrics, [
-            each.clone() if present else None for each, present in zip(shared, has_gradient, strict=True)
-        ]
+        return [each.clone() if found else None for each, found in zip(shared, present, strict=True)]
 
     def _request(self, name: str, *arguments: object) -> Any:
         try:
@@ -128,9 +143,9 @@ class RemoteLearner:
 class _Requests:
     """Methods that ``RemoteLearner`` calls by name in the other process."""
 
-    def __init__(self, settings: TrainSettings, reference: Path, weights_fd: int, gradient_fd: int) -> None:
+    def __init__(self, settings: TrainSettings, folder: Path, weights_fd: int, gradient_fd: int) -> None:
         torch.set_num_threads(settings.threads)
-        policy = saved_policy(reference, settings)
+        policy = saved_policy(folder, settings)
         self._weights = list(policy.parameters())
         shared = SharedTensors(self._weights, weights_fd)
         for parameter, tensor in zip(self._weights, shared.tensors, strict=True):
@@ -138,28 +153,39 @@ class _Requests:
         shared.close()
         self._gradient = SharedTensors(self._weights, gradient_fd)
         self._gradient.close()
-        self._learner = Learner(policy, saved_policy(reference, settings).frozen_copy(), settings.grpo)
+        self._settings = settings
+        self._learner = Learner(policy, None, settings.grpo)
         self.sample = self._learner.sample
         self.current_logprobs = self._learner.current_logprobs
         self.reference_logprobs = self._learner.reference_logprobs
 
+    def use_reference(self, folder: Path) -> None:
+        self._learner.reference = saved_policy(folder, self._settings).frozen_copy()
+
     def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[bool]]:
-        """Write the microbatch's gradient to shared memory. The list marks the parameters with a gradient."""
+        return self._with_gradient(functools.partial(self._learner.learn, microbatch))
+
+    def imitate(self, examples: Sequence[Example], tokens: int) -> tuple[float, list[bool]]:
+        return self._with_gradient(functools.partial(self._learner.imitate, examples, tokens))
+
+    def _with_gradient(self, job: Callable[[], T]) -> tuple[T, list[bool]]:
+        """Write the job's gradient to shared memory. The list marks the parameters with a gradient."""
         for parameter in self._weights:
             parameter.grad = None
-        metrics = self._learner.learn(microbatch)
+        result = job()
         for parameter, shared in zip(self._weights, self._gradient.tensors, strict=True):
             if parameter.grad is not None:
                 shared.copy_(parameter.grad)
-        return metrics, [parameter.grad is not None for parameter in self._weights]
+        return result, [parameter.grad is not None for parameter in self._weights]
 
 
 def _serve(
-    connection: Connection, settings: dict[str, Any], reference: Path, weights: Any, gradient: Any
+    connection: Connection, settings: dict[str, Any], folder: Path, weights: Any, gradient: Any
 ) -> None:
     """Answer requests until the trainer closes the connection. The trainer handles Ctrl-C for all processes.
 
-    ``reference`` is the folder of the policy after imitation; ``weights`` and ``gradient`` are descriptors from DupFd.
+    ``folder`` holds the policy, whose weights are replaced by the shared ones; ``weights`` and ``gradient`` are descriptors
+    from DupFd.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     requests: _Requests | None = None
@@ -171,7 +197,7 @@ def _serve(
         try:
             if requests is None:
                 parsed = TrainSettings.model_validate(settings)
-                requests = _Requests(parsed, reference, weights.detach(), gradient.detach())
+                requests = _Requests(parsed, folder, weights.detach(), gradient.detach())
             reply = (True, getattr(requests, name)(*arguments))
         except (TrainerError, MemoryError, *DAMAGE) as error:
             reply = (False, f"{type(error).__name__}: {error}")
@@ -189,24 +215,40 @@ class DataParallelWorkers:
         self._remotes = tuple(remotes)
 
     @classmethod
-    def start(cls, local: Learner, policy: Policy, settings: TrainSettings, reference: Path) -> Self:
-        """Start ``settings.processes - 1`` remote learners, on the CPU. ``reference`` is the reference policy's folder."""
+    @contextlib.contextmanager
+    def start(cls, policy: Policy, settings: TrainSettings) -> Iterator[Self]:
+        """Start ``settings.processes - 1`` remote learners, on the CPU, and end them with the block."""
+        local = Learner(policy, None, settings.grpo)
         if settings.processes == 1:
-            return cls(local)
+            yield cls(local)
+            return
         learning = list(policy.parameters())
         weights = SharedTensors([parameter.data for parameter in learning])
         for parameter, shared in zip(learning, weights.tensors, strict=True):
             shared.copy_(parameter.data)
             parameter.data = shared
-        remotes = [
-            RemoteLearner(number, settings, reference, weights) for number in range(1, settings.processes)
-        ]
-        weights.close()
-        return cls(local, remotes)
+        with tempfile.TemporaryDirectory(prefix="embomatrix-policy-") as name:
+            folder = Path(name)
+            policy.save(folder)
+            remotes = [
+                RemoteLearner(number, settings, folder, weights) for number in range(1, settings.processes)
+            ]
+            weights.close()
+            try:
+                yield cls(local, remotes)
+            finally:
+                for remote in remotes:
+                    remote.close()
 
     @property
     def has_remotes(self) -> bool:
         return bool(self._remotes)
+
+    def use_reference(self, reference: Policy, folder: Path) -> None:
+        """Give all learners the reference policy, which ``folder`` holds too."""
+        self.local.reference = reference
+        for loading in [remote.run(lambda each: each.use_reference(folder)) for remote in self._remotes]:
+            loading.result()
 
     def remote(self, index: int) -> RemoteLearner | None:
         """Return the owner of the microbatch with this index. None: this process."""
@@ -222,10 +264,3 @@ class DataParallelWorkers:
         }
         local = {at: job(self.local) for at, (_, job) in enumerate(jobs) if at not in futures}
         return [local[at] if at in local else futures[at].result() for at in range(len(jobs))]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for remote in self._remotes:
-            remote.close()

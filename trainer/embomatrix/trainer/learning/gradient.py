@@ -1,14 +1,18 @@
-"""Gradient of a minibatch, summed over microbatches that several processes back-propagate."""
+"""Gradient of an update, summed over microbatches that several processes back-propagate."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from torch import Tensor
 
-from embomatrix.trainer.grpo.data_parallel import DataParallelWorkers, RemoteLearner
-from embomatrix.trainer.grpo.learner import Learner, Microbatch
-from embomatrix.trainer.grpo.objective import LossMetrics
+from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
+from embomatrix.trainer.learning.learner import Learner, Microbatch
+from embomatrix.trainer.learning.likelihood import Example, plan_tokens
+from embomatrix.trainer.learning.objective import LossMetrics
 from embomatrix.trainer.policy.protocol import Policy
 
+T = TypeVar("T")
 Gradient = Sequence[Tensor | None]
 """Gradient by parameter. None: the parameter has none."""
 
@@ -36,15 +40,44 @@ class GradientSum:
         """
         if isinstance(learner, RemoteLearner):
             return learner.learn(microbatch)
+        return self._separately(functools.partial(learner.learn, microbatch))
+
+    def imitate(self, batch: Sequence[Example], size: int) -> float:
+        """Replace the sum by the gradient of the mean loss per plan token of a batch, and return this loss.
+
+        The batch is back-propagated in microbatches of ``size`` examples.
+        """
+        self.clear()
+        tokens = plan_tokens(batch)
+        parts = [batch[at : at + size] for at in range(0, len(batch), size)]
+        jobs = [(index, functools.partial(self._imitate, part, tokens)) for index, part in enumerate(parts)]
+        total = 0.0
+        for loss, gradient in self._workers.map(jobs):
+            self.add(gradient)
+            total += loss
+        return total
+
+    def _imitate(
+        self, examples: Sequence[Example], tokens: int, learner: Learner | RemoteLearner
+    ) -> tuple[float, Gradient | None]:
+        if isinstance(learner, RemoteLearner):
+            return learner.imitate(examples, tokens)
+        return self._separately(functools.partial(learner.imitate, examples, tokens))
+
+    def _separately(self, job: Callable[[], T]) -> tuple[T, Gradient | None]:
+        """Run a job of this process that adds to the parameters' gradients. Return its result, and its own gradient.
+
+        With one process that gradient is None: it stays in the parameters.
+        """
         if not self._workers.has_remotes:
-            return learner.learn(microbatch), None
+            return job(), None
         total = [parameter.grad for parameter in self._policy.parameters()]
         self.clear()
-        metrics = learner.learn(microbatch)
+        result = job()
         gradient = [parameter.grad for parameter in self._policy.parameters()]
         for parameter, part in zip(self._policy.parameters(), total, strict=True):
             parameter.grad = part
-        return metrics, gradient
+        return result, gradient
 
     def add(self, gradient: Gradient | None) -> None:
         """Add a gradient that ``learn`` returned."""

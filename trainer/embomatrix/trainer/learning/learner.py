@@ -1,4 +1,4 @@
-"""Work on one microbatch that any process with a copy of the policy can do: sample, score, back-propagate."""
+"""Work that any process with a copy of the policy can do: sample plans, score them, back-propagate a microbatch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from embomatrix.trainer.config.settings import GrpoSettings
-from embomatrix.trainer.grpo.objective import LossInputs, LossMetrics, LossTotals, surrogate_loss
+from embomatrix.trainer.learning.likelihood import Example, negative_log_likelihood
+from embomatrix.trainer.learning.objective import LossInputs, LossMetrics, LossTotals, surrogate_loss
 from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
 
@@ -29,37 +30,57 @@ class Microbatch:
     totals: LossTotals
 
 
-class Learner:
-    """A policy and its reference policy in this process."""
+@dataclass(frozen=True, slots=True)
+class SamplingRule:
+    """Rule of sampling: ``group`` plans per prompt, of at most ``max_new`` tokens."""
 
-    def __init__(self, policy: Policy, reference: Policy, settings: GrpoSettings) -> None:
-        self._policy = policy
-        self._reference = reference
+    group: int
+    temperature: float
+    max_new: int
+
+
+class Learner:
+    """A policy in this process, and its reference policy, which GRPO needs and imitation doesn't."""
+
+    def __init__(self, policy: Policy, reference: Policy | None, settings: GrpoSettings) -> None:
+        self.policy = policy
+        self.reference = reference
         self._settings = settings
 
-    def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
-        """Draw a group of plans per prompt with a generator of this seed."""
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule | None = None) -> Samples:
+        """Draw plans for each prompt with a generator of this seed, by GRPO's settings unless a rule is given."""
         settings = self._settings
-        device = next(iter(self._policy.parameters())).device
+        rule = rule or SamplingRule(settings.group, settings.temperature, settings.max_new)
+        device = next(iter(self.policy.parameters())).device
         generator = torch.Generator(device).manual_seed(seed)
-        return self._policy.sample(prompts, settings.group, settings.temperature, settings.max_new, generator)
+        return self.policy.sample(prompts, rule.group, rule.temperature, rule.max_new, generator)
 
     @torch.no_grad()
     def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
         """Return log-probabilities (plans, tokens) under the policy."""
         settings = self._settings
-        return self._policy.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
+        return self.policy.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
 
     @torch.no_grad()
     def reference_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
         """Return log-probabilities (plans, tokens) under the reference policy."""
-        settings = self._settings
-        return self._reference.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
+        settings, reference = self._settings, self.reference
+        assert reference is not None, "GRPO begins with a reference policy"
+        return reference.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
+
+    def imitate(self, examples: Sequence[Example], tokens: int) -> float:
+        """Add the gradient of the examples' loss to the gradients of the policy's parameters, and return the loss.
+
+        ``tokens`` is the denominator: the plan tokens of the whole batch.
+        """
+        loss = negative_log_likelihood(self.policy, examples) / tokens
+        torch.autograd.backward(loss)
+        return float(loss.detach())
 
     def learn(self, microbatch: Microbatch) -> LossMetrics:
         """Add the microbatch's gradient to the gradients of the policy's parameters."""
         settings = self._settings
-        scores = self._policy.logprobs(
+        scores = self.policy.logprobs(
             microbatch.prompts,
             microbatch.tokens,
             microbatch.mask,
