@@ -275,10 +275,20 @@ class _CallWriter:
             self._wet.add(item.name)
 
     def _put_back(self, item: PromptRow, place: tuple[str, Relation | None]) -> Iterator[SkillCall]:
-        """Put the held object where it was; on the first fixed row if the prompt doesn't tell."""
+        """Put the held object where it was; on the first fixed row if the prompt doesn't tell.
+
+        A misread sentence may name a fixed object as a tool: it is not put on itself, or on what it bears.
+        """
         host, relation = place
         known = host in self._rows and relation is not None
-        back = self._rows[host] if known else next(row for row in self._rows.values() if row.fixed)
+        fixed = (
+            row
+            for row in self._rows.values()
+            if row.fixed and row is not item and item.name not in self._bearers(row)
+        )
+        back = self._rows[host] if known else next(fixed, None)
+        if back is None:
+            return
         yield from self._move(back)
         put = PlaceRelation(relation.value) if known and relation is not None else PlaceRelation.ONTOP
         yield SkillCall(Skill.PLACE, back.index, relation=put)

@@ -22,3 +22,11 @@ def test_nothing_is_put_on_what_it_bears_itself() -> None:
 def test_what_bears_a_thing_is_known_through_all_levels() -> None:
     stacked = [carry("bowl_1", "bowl_2"), carry("pear_1", "bowl_1"), carry("bowl_2", "pear_1")]
     assert in_words(plan_for(stacked, situation(""), HABITS)).count("pick_up") == 2
+
+
+def test_a_fixed_object_misread_as_a_tool_is_put_back_elsewhere() -> None:
+    dusted = ScriptDemand("dusty", False, (ROW["bowl_2"],), (ROW["countertop_1"],))
+    borne = ScriptDemand("dusty", False, (ROW["apple_1"],), (ROW["bowl_1"],))
+    words = in_words(plan_for([dusted, borne], situation(""), HABITS))
+    assert "pick_up countertop_1" in words
+    assert "place fridge_1 ontop" in words
