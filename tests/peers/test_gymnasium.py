@@ -52,9 +52,19 @@ for wrong, words in wrongs:
     else:
         raise AssertionError(wrong)
 try:
-    HouseholdEnv(sys.argv[1], render_mode="rgb_array")
+    HouseholdEnv(sys.argv[1], render_mode="human")
 except ValueError as error:
-    assert "expected ansi" in str(error)
+    assert "expected ansi or rgb_array" in str(error)
+filmed = HouseholdEnv(sys.argv[1], render_mode="rgb_array")
+filmed.reset(seed=1, options={"task_id": "apple_to_counter"})
+before = filmed.render()
+filmed.step("move 10")
+assert before.shape == (480, 640, 3) and before.dtype == "uint8" and (before != filmed.render()).any()
+filmed.close()
+try:
+    env.reset(options={"task": "apple_to_counter"})
+except ValueError as error:
+    assert "no option 'task': expected task_id" in str(error)
 try:
     env.reset(options={"task_id": "elsewhere"})
 except ValueError as error:

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape as without_markup
 from rich.table import Table
 
+from embomatrix.cli.plan_text import plan_with_names, rows_for_names
 from embomatrix.cli.play_by_hand import play_by_hand
 from embomatrix.envs.episode import Episode
 from embomatrix.factory.commands.terminal import counter, fail, user_errors
@@ -29,9 +30,9 @@ from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.state.facts import FactError
 from embomatrix.skills.describe import call_in_words
-from embomatrix.skills.parse import PlanError, parse_plan
+from embomatrix.skills.parse import PlanError, plan_to_lines, prose_lines
 from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for, situation_of
-from embomatrix.skills.syntax import MAX_PLAN_BYTES, Plan
+from embomatrix.skills.syntax import MAX_PLAN_BYTES, MAX_STEPS, Plan
 from embomatrix.skills.trace import Trace
 from embomatrix.starter.options import DatasetOrShipped
 from embomatrix.starter.shipped import dataset_folder
@@ -67,7 +68,9 @@ def play(
     plan: Annotated[
         str,
         typer.Option(
-            "--plan", help="File with a plan, as JSON or one call per line; '-' reads standard input."
+            "--plan",
+            help="File with a plan, as JSON or one call per line, with rows or names of objects; '-' reads standard "
+            "input.",
         ),
     ] = "",
     oracle: Annotated[bool, typer.Option("--oracle", help="Execute the oracle planner's plan.")] = False,
@@ -142,11 +145,21 @@ def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: str | None, s
     try:
         if policy is not None:
             return _plan_of_policy(policy, situation_of(bundle.scene, task), seed)
-        return parse_plan(text or "", task.profile)
+        return _plan_of_person(text or "", task)
     except PlanError as error:
         console.print(f"[red]✗[/red] the text can't be parsed ({error.reason.value}): {escape(str(error))}")
         _show_reward(unparsable())
         raise typer.Exit(NO_PLAN) from None
+
+
+def _plan_of_person(text: str, task: Task) -> Plan:
+    """Parse a text, and print lines that are no calls, and whether names were read. Raises PlanError."""
+    for line in prose_lines(rows_for_names(text, task.table), task.profile)[:MAX_STEPS]:
+        console.print(f"[yellow]![/yellow] not a call, and passed over: {escape(line)}")
+    plan = plan_with_names(text, task)
+    if rows_for_names(text, task.table) != text:
+        console.print("names of objects were read as rows; the cluster reads rows only\n", style="dim")
+    return plan
 
 
 def _play_by_hand(bundle: Bundle, task: Task, seed: int) -> None:
@@ -165,9 +178,12 @@ def _play_by_hand(bundle: Bundle, task: Task, seed: int) -> None:
     with contextlib.closing(load_simulator(bundle)) as simulator:
         episode = Episode(simulator, task, situation_of(bundle.scene, task))
         episode.reset(seed)
-        reward = play_by_hand(episode, read, show, seed)
+        reward, calls = play_by_hand(episode, read, show, seed)
     if reward is not None:
         _show_reward(reward)
+    if calls:
+        console.print("\n[bold]Plan[/bold] of the calls that succeeded, for --plan FILE")
+        console.print(plan_to_lines(calls), markup=False)
 
 
 def _plan_of_policy(named: str, situation: Situation, seed: int) -> Plan:
@@ -216,6 +232,8 @@ def _text_of(plan: str) -> str:
                 raw = file.read(MAX_PLAN_BYTES + 1)
     except OSError as error:
         fail(f"the plan {plan!r} can't be read ({error.strerror}): expected a text file")
+    if b"\0" in raw:
+        fail(f"the plan {plan!r} is not text: expected a text file with JSON or one call a line")
     # The parser judges the text, so invalid bytes are replaced here and not refused.
     return raw.decode("utf-8", errors="replace")
 

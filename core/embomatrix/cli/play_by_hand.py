@@ -1,44 +1,52 @@
 """A task played by hand: one call a line, each answered at once."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
+from embomatrix.cli.plan_text import plan_with_names
 from embomatrix.envs.episode import Episode
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.skills.parse import PlanError, parse_plan
-from embomatrix.skills.syntax import MAX_STEPS, SkillCall
+from embomatrix.skills.parse import PlanError, PlanReason
+from embomatrix.skills.syntax import MAX_STEPS, PROFILES, SIGNATURES, Plan, Skill, SkillCall
 from embomatrix.world.task import Task
 
 HELP: Final = (
     "One call a line, with a row or a name: `move 3`, `pick_up apple_1`, `place 0 inside`. `state` shows where everything is, "
-    "`restart` begins again, `quit` ends. A failed call changes nothing."
+    "`restart` begins again, `help` lists the calls, `quit` ends. A failed call changes nothing."
 )
 
 
 def play_by_hand(
     episode: Episode, read: Callable[[], str | None], show: Callable[[str], None], seed: int
-) -> RewardBreakdown | None:
+) -> tuple[RewardBreakdown | None, Plan]:
     """Execute the calls that ``read`` returns until the goal is reached, ``MAX_STEPS`` calls were made or the input ends.
 
-    ``read`` returns None at the end of the input. Return the reward of the state reached, None without any call.
+    ``read`` returns None at the end of the input. Return the reward of the state reached, None without any call, and the
+    calls that succeeded: as a plan they lead to this state.
     """
     show(HELP)
     reward: RewardBreakdown | None = None
+    done: list[SkillCall] = []
     while (line := read()) is not None and (words := line.split()) != ["quit"]:
         if words == ["state"]:
             show("\n".join(episode.state()))
+        elif words == ["help"]:
+            show("\n".join([HELP, *map(signature, PROFILES[episode.task.profile])]))
         elif words == ["restart"]:
             episode.reset(seed)
             reward = None
+            done.clear()
             show("the scene is as it was at the start")
         elif words:
             try:
-                call = call_in(words, episode.task)
+                call = call_in(line, episode.task)
             except PlanError as error:
-                show(f"{error}. {HELP}")
+                show(f"{error}; `help` lists the calls")
                 continue
             outcome = episode.act(call)
             reward = outcome.reward
+            if outcome.step.ok:
+                done.append(call)
             show(f"{'✓' if outcome.step.ok else '✗'} {outcome.step.message}")
             if reward.success:
                 show("the goal is reached")
@@ -46,12 +54,17 @@ def play_by_hand(
             if outcome.over:
                 show(f"a plan has at most {MAX_STEPS} calls")
                 break
-    return reward
+    return reward, tuple(done)
 
 
-def call_in(words: Sequence[str], task: Task) -> SkillCall:
+def signature(skill: Skill) -> str:
+    """Return a skill with its arguments, ``place object_index relation``."""
+    return " ".join([skill.value, *(argument.value for argument in SIGNATURES[skill])])
+
+
+def call_in(line: str, task: Task) -> SkillCall:
     """Return the one call in a line, in which names of objects stand for their rows. Raises PlanError."""
-    rows = {name: str(row) for row, name in enumerate(task.table)}
-    skill, *arguments = words
-    plan = parse_plan(" ".join([skill, *(rows.get(word, word) for word in arguments)]), task.profile)
+    plan = plan_with_names(line, task)
+    if len(plan) != 1:
+        raise PlanError(PlanReason.TOO_MANY_STEPS, f"found {len(plan)} calls: expected one call a line")
     return plan[0]

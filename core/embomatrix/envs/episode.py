@@ -11,12 +11,14 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.film import FilmFrame, snapshot
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.prompt import Codec, Prompt, Situation, prompt_for, situation_of
 from embomatrix.skills.syntax import MAX_STEPS, Plan, SkillCall
 from embomatrix.skills.trace import Step, Trace
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset, TaskRecord
+from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
 SCENES_KEPT: Final = 4
@@ -82,6 +84,15 @@ class Episode:
     def state(self) -> tuple[str, ...]:
         """State reached, one line per object of the table."""
         return self._simulator.survey(self.task)
+
+    @property
+    def scene(self) -> Scene:
+        """Scene at its start."""
+        return self._simulator.world.scene
+
+    def frame(self) -> FilmFrame:
+        """State reached, as a frame of a film."""
+        return snapshot(self._simulator.world, self._calls)
 
     def _score(self) -> RewardBreakdown:
         return score(self.task, self._simulator.touched, self._simulator.facts, self._reward)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, SupportsFloat
 
 import numpy as np
+from numpy.typing import NDArray
 
 try:
     import gymnasium
@@ -21,6 +22,7 @@ except ModuleNotFoundError as error:
 
 from embomatrix.envs.episode import Episode, EpisodeStep, Household
 from embomatrix.reward.hierarchy import unparsable
+from embomatrix.sim.film_stage import RoomCamera
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.parse import PlanError, PlanReason, parse_plan
 from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, SkillCall
@@ -28,7 +30,9 @@ from embomatrix.world.dataset import SPLITS, DatasetError
 from embomatrix.world.task import MAX_TABLE, Profile
 
 ENV_ID: Final = "EmboMatrix/Household-v0"
-RENDER_MODES: Final = ("ansi",)
+RENDER_MODES: Final = ("ansi", "rgb_array")
+PICTURE_PX: Final = (640, 480)
+RESET_OPTIONS: Final = ("task_id",)
 SKILLS: Final = PROFILES[Profile.HOUSEHOLD]
 RELATIONS: Final = tuple(PlaceRelation)
 MOST_ROOMS: Final = 32
@@ -49,6 +53,9 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     *Observation*, a dict of texts: ``task`` (the prompt, constant), ``state`` (one line per object), ``message`` (the outcome
     of the last call).
+
+    *Rendering*: with ``render_mode="ansi"`` the state in words; with ``"rgb_array"`` the robot's room from above, RGB values of
+    shape (480, 640, 3), as ``gymnasium.wrappers.RecordVideo`` takes them.
 
     The reward of a step is its gain. An episode terminates at the goal and is truncated after 64 calls; a failed call changes
     nothing.
@@ -74,6 +81,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         if not self._task_ids:
             raise DatasetError(f"the dataset at {dataset} has no task of the split {split!r}: pass another")
         self._episode: Episode | None = None
+        self._camera: RoomCamera | None = None
         self._message = ""
         self._calls = spaces.Dict(
             {
@@ -95,8 +103,11 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode. Raises DatasetError for an unknown task."""
+        """Start an episode. Raises DatasetError for an unknown task, ValueError for an unknown option."""
         super().reset(seed=seed)
+        unknown = sorted(set(options or {}) - set(RESET_OPTIONS))
+        if unknown:
+            raise ValueError(f"reset has no option {unknown[0]!r}: expected {', '.join(RESET_OPTIONS)}")
         drawn = self._task_ids[int(self.np_random.integers(len(self._task_ids)))]
         self._episode = self._household.episode(str((options or {}).get("task_id", drawn)))
         self._episode.reset(int(self.np_random.integers(2**31)))
@@ -152,14 +163,25 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             _check_number(name, action[name], int(space.n) if isinstance(space, spaces.Discrete) else None)
         return call_of(action, episode.situation.rooms)
 
-    def render(self) -> str | None:
-        """State in words, with ``render_mode="ansi"``."""
-        if self.render_mode != "ansi" or self._episode is None:
+    def render(self) -> str | NDArray[np.uint8] | None:
+        """State in words, or a picture of the robot's room, by ``render_mode``. Raises EngineError without pybullet."""
+        if self._episode is None or self.render_mode is None:
             return None
-        return "\n".join([*self._episode.state(), self._message])
+        if self.render_mode == "ansi":
+            return "\n".join([*self._episode.state(), self._message])
+        if self._camera is None or self._camera.scene is not self._episode.scene:
+            self._close_camera()
+            self._camera = RoomCamera(self._episode.scene)
+        return self._camera.shoot(self._episode.frame(), *PICTURE_PX)
 
     def close(self) -> None:
+        self._close_camera()
         self._household.close()
+
+    def _close_camera(self) -> None:
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
 
     def _observed(self, episode: Episode) -> dict[str, Any]:
         prompt = episode.prompt()

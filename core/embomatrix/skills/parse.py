@@ -79,6 +79,14 @@ def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
     return _parse_lines(answer, profile)
 
 
+def prose_lines(text: str, profile: Profile) -> list[str]:
+    """Return the parts of a text that ``parse_plan`` passes over as prose; none for a text with a JSON plan."""
+    answer = _without_reasoning(text)
+    if last_json_plan(answer, json.JSONDecoder()) is not None:
+        return []
+    return [" ".join(words) for words in _segments(answer) if not _is_call(words, profile)]
+
+
 def plan_from_json(value: object, profile: Profile = Profile.PAPER) -> Plan:
     """Return the plan in a decoded JSON value: an array of calls, or an object that holds one. Raises PlanError."""
     steps = _steps_in(value)

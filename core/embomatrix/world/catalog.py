@@ -273,6 +273,8 @@ def _look_up(table: Mapping[str, Json], name: str, kind: str) -> Json:
             name, table, n=3, cutoff=0.5
         )
         hint = f"did you mean {', '.join(close)}?" if close else f"for example {', '.join(sorted(table)[:3])}"
+        if kind == "scene":
+            hint += " A scene of your own is named by its file, such as scenes/my_flat.json"
         raise CatalogError(f"unknown {kind} {name!r} (the catalog holds {len(table)}): {hint}") from None
 
 

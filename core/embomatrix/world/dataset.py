@@ -75,9 +75,11 @@ class Dataset:
         try:
             lines = path.read_text(encoding="utf-8").split("\n")
         except OSError as error:
+            if folder.is_file():
+                raise DatasetError(f"{folder} is a file: expected the folder of a dataset") from error
             raise DatasetError(
                 f"there is no dataset in {folder}: {path} can't be read ({error.strerror}); "
-                f"get the shipped one with `embomatrix factory starter --out={folder}`, or name another folder with --dataset"
+                f"get the shipped one with `embomatrix factory starter --out={folder}`, or name another folder"
             ) from error
         except UnicodeDecodeError as error:
             raise DatasetError(

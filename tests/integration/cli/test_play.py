@@ -134,6 +134,24 @@ def test_shipped_policy_plays_a_shipped_task(tmp_path):
     assert "success" in result.output
 
 
+def test_typed_plan_may_name_objects_and_shows_the_lines_that_are_no_calls(run):
+    result = run("apple_to_counter", "--plan", "-", text="move apple_1\npick up apple_1\nmove countertop_1\n")
+    printed = " ".join(result.output.split())
+    assert result.exit_code == 0, result.output
+    assert "not a call, and passed over: pick up 10" in printed
+    assert "names of objects were read as rows" in printed
+    assert "2 ✓ move countertop_1" in printed
+    wrong = run("apple_to_counter", "--plan", "-", text="move aple_1\n")
+    assert (wrong.exit_code, "did you mean apple_1" in " ".join(wrong.output.split())) == (1, True)
+
+
+def test_picture_as_a_plan_is_refused(run, tmp_path):
+    picture = tmp_path / "plan.png"
+    Image.new("RGB", (2, 2)).save(picture)
+    result = run("apple_to_counter", "--plan", str(picture))
+    assert (result.exit_code, "is not text: expected" in " ".join(result.output.split())) == (2, True)
+
+
 def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
     result = run("apple_to_counter", "--show")
     assert result.exit_code == 0
@@ -144,12 +162,16 @@ def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
 
 
 def test_task_is_played_by_hand_call_by_call(run):
-    typed = "pick_up apple_1\ndance 3\nmove apple_1\nstate\npick_up 10\nmove countertop_1\nplace 0 ontop\nmove 1\n"
+    typed = "pick_up apple_1\ndance 3\nhelp\npick_up aple_1\n"
+    typed += "move apple_1\nstate\npick_up 10\nmove countertop_1\nplace 0 ontop\nmove 1\n"
     result = run("apple_to_counter", "--interactive", text=typed)
     assert result.exit_code == 0, result.output
     printed = " ".join(result.output.split())
     assert "✗ apple_1 is" in printed, "a failed call changes nothing"
     assert "unknown skill 'dance'" in printed
+    assert "move object_index" in printed, "`help` lists the calls"
+    assert "did you mean apple_1" in printed
+    assert printed.endswith("for --plan FILE move 10 pick_up 10 move 0 place 0 ontop")
     assert "✓ put apple_1 on top of countertop_1 the goal is reached" in printed
     assert "Reward" in printed
     assert "✓ stands at" not in printed.split("the goal is reached")[1], "the task ends at the goal"

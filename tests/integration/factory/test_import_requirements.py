@@ -43,6 +43,13 @@ def asset_of(model):
     return build_asset(Catalog.load(), model.category, model.model_id)
 
 
+def test_imported_model_of_the_scene_is_tried_first() -> None:
+    generated = models_for(CARTON, np.random.default_rng(0), Requirement())
+    last = asset_of(generated[-1])
+    chosen = models_for(CARTON, np.random.default_rng(0), Requirement(), imported={last.asset_id: last})
+    assert chosen[0] == generated[-1] != generated[0]
+
+
 def test_contents_are_shared_among_containers_and_static_objects_are_not_carried() -> None:
     requirements = requirements_of(parse_problem(BOXES))
     on_floor = (Relation.ONTOP, "floor.n.01_1")

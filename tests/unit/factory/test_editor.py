@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,7 @@ from embomatrix.factory.layout.sampling import ObjectSampler
 from embomatrix.factory.scenes.check import check_scene
 from embomatrix.factory.scenes.editor import LayoutReason, PlacementError, SceneEditor
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
+from embomatrix.world.asset import Credit
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
@@ -37,6 +39,16 @@ def test_added_object_rests_on_its_host(flat: Scene, relation: Relation, host: s
         scene.by_name[n].host == a_host(flat, host) and scene.by_name[n].relation is relation for n in names
     )
     assert not any(scene.by_name[n].fixed for n in names)
+
+
+def test_new_object_of_an_imported_model_is_the_imported_one(flat: Scene) -> None:
+    name = a_host(flat, "breakfast_table")
+    imported = replace(flat.asset_of(name), credit=Credit("A. Maker", "CC0-1.0", "table.obj"))
+    edit = SceneEditor(replace(flat, assets={**flat.assets, imported.asset_id: imported}))
+    category, _, model = imported.asset_id.partition("-")
+    added = sampler(edit).add(category, model, None, "living_room_0")
+    scene = edit.freeze("task-scene")
+    assert scene.asset_of(added) is scene.asset_of(name) is imported
 
 
 def test_floor_object_is_in_its_room_and_reachable(flat: Scene) -> None:

@@ -285,7 +285,9 @@ def test_command_reports_a_mug_that_is_too_narrow(tmp_path: Path) -> None:
     assert "fillable: its largest cavity is 0.0" in done.output
 
 
-@pytest.mark.parametrize(("model", "words"), [("bamfsz", " Rs_int,"), ("songes", "no base scene uses it")])
+@pytest.mark.parametrize(
+    ("model", "words"), [("bamfsz", " Rs_int,"), ("songes", "furniture = {bottom_cabinet-songes = 1}")]
+)
 def test_command_names_the_scenes_that_use_the_model(tmp_path: Path, model: str, words: str) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))

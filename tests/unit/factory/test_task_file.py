@@ -103,7 +103,7 @@ MISTAKES = [
     ('scene = "Rs_int"\ngoal', '# goal', "found no key 'goal'"),
     ("Could you", "Could\\u0007 you", "instruction: found"),
     ('instruction = "Could', 'instruction = "" # ', "instruction: found ''"),
-    ("goal = ", "goal = 3 # ", "goal: found 3: expected `str`"),
+    ("goal = ", "goal = 3 # ", "goal: found 3: expected text in quotes"),
     ("(not (open fridge_1)))", "(not (open fridge_1))", "goal: line 1, column 1: the parenthesis opened here"),
     ("inside apple_1", "inisde apple_1", "goal: line 1, column 6: unknown predicate 'inisde'"),
     ("inside apple_1", "inside pear_1", "goal: line 1, column 14: object 'pear_1' is not declared: add it to [objects]"),
@@ -119,7 +119,8 @@ MISTAKES = [
     ("ontop table_1", "not not open", "objects.apple_1: found 'not not open'"),
     ("ontop table_1", "and", "objects.apple_1: found 'and'"),
     ("inroom kitchen_0", "inroom ktchen", "such as kitchen_0; did you mean kitchen?"),
-    ('"inroom kitchen_0", ', "3, ", "objects['fridge_1'][0]: found 3"),
+    ('"inroom kitchen_0", ', "3, ", "objects.fridge_1[0]: found 3"),
+    ("[objects]", "[rooms]\n[objects]", "this file is a floor plan, for `embomatrix scene build`"),
     ("[objects]", "[objects]\napple_1 = ", "is not TOML"),
 ]  # fmt: skip
 

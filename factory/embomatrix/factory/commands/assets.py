@@ -113,10 +113,10 @@ def import_(
     """Import a model file as an asset that replaces one of the catalog's models in `scene build --assets`."""
     credit = Credit(creator, licence, source or file.name)
     with user_errors(out, more=(ModelFileError, SceneInvalidError)):
-        out.mkdir(parents=True, exist_ok=True)
         raw = read_model(file, up)
         decompose = Coacd() if cut is Cut.COACD else by_components
         imported = import_model(Catalog.load(), raw, category, model, credit, decompose)
+        out.mkdir(parents=True, exist_ok=True)
         keep_foreign("", [asset_file(out, imported.asset)], ASSET_MARK, force=force)
         path = save_asset(out, imported.asset)
     _tell(imported, path)
@@ -157,9 +157,10 @@ def _stands_in(asset_id: str) -> str:
         )
     ]
     return (
-        f"it is used in {', '.join(listing)}"
+        f"it is used in {', '.join(listing)}, built with --assets"
         if listing
-        else "no base scene uses it: give a --model that a scene lists"
+        else "no base scene lists this model: give a --model that one lists, or ask for it in a floor plan: "
+        f"furniture = {{{asset_id} = 1}}"
     )
 
 

@@ -10,10 +10,10 @@ from msgspec import UNSET, Meta, UnsetType
 
 from embomatrix.factory.floorplan.spec import MIN_DOOR_M
 from embomatrix.factory.floorplan.walls import WALL_M, Rect, shared_edge
-from embomatrix.factory.toml_files import TomlFileError, check_keys, close_to, read_toml, wrong
-from embomatrix.world.bddl import ROOM_TYPES, is_room_instance
+from embomatrix.factory.toml_files import TomlFileError, check_keys, read_toml, record_of, wrong, wrong_room
+from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.records import Record, SceneInvalidError, convert
+from embomatrix.world.records import Record, SceneInvalidError
 
 SUFFIX: Final = ".toml"
 MAX_BYTES: Final = 1024 * 1024
@@ -110,7 +110,7 @@ def read_house(path: Path) -> House:
         raise HouseFileError(str(error)) from error
     try:
         _check_keys(value)
-        house = _house(convert(value, HouseTable, _ROOT))
+        house = _house(record_of(value, HouseTable, _ROOT))
         _check_places(house)
         _check_doors(house)
     except SceneInvalidError as error:
@@ -150,8 +150,7 @@ def _house(table: HouseTable) -> House:
 def _room(name: str, table: HouseRoomTable) -> HouseRoom:
     key = f"rooms.{name[:60]}"
     if not (is_room_instance(name) and name.isascii()):
-        hint = close_to(name.rstrip("_0123456789"), ROOM_TYPES)
-        raise wrong(key, repr(name[:60]), f"a room type and a number, such as kitchen_0; {hint}")
+        raise wrong_room(key, name, repr(name[:60]), "a room type and a number, such as kitchen_0")
     if (table.size_m is UNSET) is (table.rect_m is UNSET):
         given = "neither size_m nor rect_m" if table.size_m is UNSET else "both size_m and rect_m"
         raise wrong(key, given, "one of them")

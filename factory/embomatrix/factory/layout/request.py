@@ -51,7 +51,8 @@ class RequestedObject:
 
     ``relation`` and ``host`` are demanded by the task; the host is another requested object, a scene object, or a
     room for its floor. None and an empty string leave the choice to the agents. ``rooms`` lists the allowed rooms;
-    empty means all. ``beside`` lists the objects that it must stand next to.
+    empty means all. ``beside`` lists the objects that it must stand next to. ``imported`` holds the scene's imported models by
+    asset id; they take the place of generated ones.
     """
 
     name: str
@@ -60,10 +61,12 @@ class RequestedObject:
     host: str = ""
     rooms: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
+    imported: Mapping[str, Asset] = field(default_factory=dict)
 
     def asset(self, choice: int) -> Asset:
         """Return the asset of a model. Raise IndexError for an unknown choice."""
-        return build_asset(Catalog.load(), *self.models[choice])
+        category, model = self.models[choice]
+        return self.imported.get(f"{category}-{model}") or build_asset(Catalog.load(), category, model)
 
     def failure(self, host: str, reason: LayoutReason, detail: str) -> LayoutFailure:
         """Return a failure of this object at ``host``, in the demanded relation or else on top."""

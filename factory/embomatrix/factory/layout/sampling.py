@@ -50,7 +50,8 @@ class ObjectSampler:
         floor. Without a model, models of the category are tried in random order. Raise PlacementError.
         """
         errors: list[PlacementError] = []
-        for asset in assets_of(category, model, self._rng):
+        for generated in assets_of(category, model, self._rng):
+            asset = self._editor.imported.get(generated.asset_id, generated)
             try:
                 pose = self.find(asset, relation, host)
             except PlacementError as error:

@@ -14,6 +14,7 @@ from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_e
 from embomatrix.sim.bullet.robot import tucked
 from embomatrix.sim.bullet.visual_scene import VisualScene
 from embomatrix.sim.film import FRAMES_PER_S, Film, FilmFrame
+from embomatrix.sim.film_stage import FilmStage
 from embomatrix.sim.process_pool import process_pool
 from embomatrix.world.scene import Room, Scene
 
@@ -115,34 +116,20 @@ class _FrameRenderer:
     """Stages of one process, updated from frame to frame: one with low walls to look into, one with full walls."""
 
     def __init__(self, scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
-        self._scene = scene
-        self._open, self._whole = VisualScene(scene), VisualScene(scene)
-        furnish_cutaway(self._open)
-        furnish_whole(self._whole)
+        self._open, self._whole = FilmStage(VisualScene(scene)), FilmStage(VisualScene(scene))
+        furnish_cutaway(self._open.stage)
+        furnish_whole(self._whole.stage)
         self._rooms = rooms
-        self._robot = self._open.add_robot()
-        self._changed: set[str] = set()
+        self._robot = self._open.stage.add_robot()
 
     def shoot(self, frame: FilmFrame) -> tuple[Image.Image, Image.Image]:
         """Return an oblique view of the rooms of the frame's step, and the robot's camera view."""
-        changed = {*frame.poses, *frame.joints, *frame.hidden}
-        for name in sorted(changed | self._changed):
-            self._show(frame, name)
-        self._changed = changed
+        self._open.show(frame)
+        self._whole.show(frame)
         self._robot.stand(frame.posture or tucked(frame.robot))
-        room = shoot_oblique(self._open, self._rooms[frame.step], *ROOM_PX)
-        eye = shoot_egocentric(self._whole, frame.robot, *EYE_PX)
+        room = shoot_oblique(self._open.stage, self._rooms[frame.step], *ROOM_PX)
+        eye = shoot_egocentric(self._whole.stage, frame.robot, *EYE_PX)
         return Image.fromarray(np.asarray(room)), Image.fromarray(np.asarray(eye))
-
-    def _show(self, frame: FilmFrame, name: str) -> None:
-        item = self._scene.by_name[name]
-        gone = name in frame.hidden or (item.absent and name not in frame.poses)
-        pose = frame.poses.get(name, item.pose_world_asset)
-        for stage in (self._open, self._whole):
-            if gone:
-                stage.hide(name)
-            else:
-                stage.put(name, pose, frame.joints.get(name, item.joints))
 
 
 _renderer: _FrameRenderer | None = None

@@ -103,6 +103,11 @@ class SceneEditor:
         """Return an object's asset. Raise PlacementError for an unknown name."""
         return self._assets[self.known(name).asset_id]
 
+    @property
+    def imported(self) -> Mapping[str, Asset]:
+        """Imported models that the base scene uses, by asset id. New objects of these ids must use them, too."""
+        return {key: asset for key, asset in self.base.assets.items() if asset.credit is not None}
+
     def box_of(self, name: str) -> Aabb:
         """Return an object's box in the world with closed joints. Raise PlacementError for an unknown name."""
         return self._boxes.whole(self.asset_of(name), self.known(name).pose_world_asset)

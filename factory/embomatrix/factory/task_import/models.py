@@ -33,13 +33,20 @@ def models_for(
     rng: np.random.Generator,
     requirement: Requirement,
     categories: Sequence[str] | None = None,
+    imported: Mapping[str, Asset] | None = None,
 ) -> list[Model]:
     """Return at most five models of the type, or of these categories, with the required abilities, liftable ones first.
 
     Among liftable models, large ones come first if the object supports others, otherwise small ones. Among furniture,
     two of medium size come first, then the smallest. On other furniture only small models are used. If no liftable
-    model has space for all contents, models that do come first, unless the object is carried.
+    model has space for all contents, models that do come first, unless the object is carried. The scene's ``imported`` models,
+    by asset id, come before all others.
     """
+    own = imported or {}
+
+    def asset_of(model: Model) -> Asset:
+        return own.get(model.asset_id) or _asset(model)
+
     catalog = Catalog.load()
     models = [
         (model, catalog.category(category).mass_kg)
@@ -55,14 +62,15 @@ def models_for(
         else:
             heavy.append((volume, model))
     order = [*_ranked(light), *(_ranked(heavy) if addition.host else _middling_first(heavy))]
-    able = [model for model in order[:LOOKED_AT] if has_abilities(_asset(model), addition.needs)]
+    order.sort(key=lambda model: model.asset_id not in own)
+    able = [model for model in order[:LOOKED_AT] if has_abilities(asset_of(model), addition.needs)]
     if requirement.contents:
         # A stable sort: models with space for everything come first.
         carried = [model for _, model in light] if requirement.carried else []
         able.sort(
             key=lambda model: (
                 bool(carried) and model not in carried,
-                room_for(_asset(model), requirement.contents),
+                room_for(asset_of(model), requirement.contents),
             )
         )
     return able[:MODEL_TRIES]

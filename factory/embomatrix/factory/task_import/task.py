@@ -38,6 +38,7 @@ from embomatrix.factory.task_import.task_fields import (
 )
 from embomatrix.factory.writer.categories import REAL, SWITCHED, category_of
 from embomatrix.factory.writer.tasks import object_table
+from embomatrix.world.asset import Asset
 from embomatrix.world.bddl import BddlProblem, InitLiteral, is_room_instance
 from embomatrix.world.catalog import Catalog, Model, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
@@ -234,7 +235,10 @@ class _Binder:
         """Add all missing objects to the scene."""
         editor.keep(binding.found.values())
         models = self._models(binding, editor)
-        items = [self._item(addition, binding, models[addition.name]) for addition in binding.additions]
+        items = [
+            self._item(addition, binding, models[addition.name], editor.imported)
+            for addition in binding.additions
+        ]
         return self._options.lay(editor, items, int(self._rng.integers(2**31)))
 
     def _models(self, binding: Binding, editor: SceneEditor) -> Mapping[str, Sequence[Model]]:
@@ -249,6 +253,7 @@ class _Binder:
                 self._rng,
                 requirements[each.name],
                 self._options.categories_of(binding.problem, each.name),
+                editor.imported,
             )
             for each in binding.additions
         }
@@ -263,7 +268,9 @@ class _Binder:
         found = {name: editor.asset_of(there) for name, there in binding.found.items()}
         return with_sizes(orders, binding.additions, requirements, found, compact=self._options.compact)
 
-    def _item(self, addition: Addition, binding: Binding, models: Sequence[Model]) -> RequestedObject:
+    def _item(
+        self, addition: Addition, binding: Binding, models: Sequence[Model], imported: Mapping[str, Asset]
+    ) -> RequestedObject:
         rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
         demanded = addition.relation is not None
         host = binding.found.get(addition.host, addition.host) or (addition.room if demanded else "")
@@ -274,6 +281,7 @@ class _Binder:
             host=host,
             rooms=() if host or addition.beside else rooms,
             beside=tuple(binding.found.get(other, other) for other in addition.beside),
+            imported=imported,
         )
 
     def _add_pieces(self, editor: SceneEditor, whole: str, halves: tuple[str, ...]) -> tuple[str, ...]:
@@ -286,7 +294,8 @@ class _Binder:
             for model in catalog.models_of(category)
         ]
         model = min(models, key=lambda model: abs(math.prod(model.size_m) - half_m3))
-        return editor.add_pieces(whole, build_asset(catalog, model.category, model.model_id), len(halves))
+        asset = editor.imported.get(model.asset_id) or build_asset(catalog, model.category, model.model_id)
+        return editor.add_pieces(whole, asset, len(halves))
 
     def _task(
         self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[InitLiteral, ...]

@@ -11,7 +11,7 @@ from msgspec import Meta
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.sources import ProblemSourceError, SourceText, read_file
-from embomatrix.factory.toml_files import TomlFileError, check_keys, close_to, read_toml, wrong
+from embomatrix.factory.toml_files import TomlFileError, check_keys, read_toml, record_of, wrong, wrong_room
 from embomatrix.world.bddl import (
     ROOM_TYPES,
     BddlError,
@@ -23,7 +23,7 @@ from embomatrix.world.bddl import (
 )
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.goal import Atom, Formula
-from embomatrix.world.records import Record, SceneInvalidError, Text, convert
+from embomatrix.world.records import Record, SceneInvalidError, Text
 from embomatrix.world.state import Relation
 
 SUFFIX: Final = ".toml"
@@ -33,6 +33,7 @@ SOURCE: Final = "file"
 SENSES: Final = ("n.01", "n.02", "n.03", "n.04")
 """Senses of a word that is not a category."""
 _ROOT: Final = "task"
+_OTHER_SUFFIX: Final = f" (a file that does not end in {SUFFIX} is read as BDDL)"
 _OBJECT: Final = re.compile(r"([a-z][a-z0-9_]*?)_([0-9]{1,3})\Z")
 _AT: Final = re.compile(r"line \d+, column (\d+): ")
 
@@ -63,15 +64,17 @@ def read_task_file(path: Path) -> TaskFile:
     Raises ProblemSourceError that names file and key, for BDDL file, line and column.
     """
     if path.suffix != SUFFIX:
-        source = read_file(path)
         try:
+            source = read_file(path)
             return TaskFile(source, read_problem(source)[0])
+        except ProblemSourceError as error:
+            raise ProblemSourceError(f"{error}{_OTHER_SUFFIX}") from error
         except BddlError as error:
-            raise ProblemSourceError(f"{path}: {error}") from error
+            raise ProblemSourceError(f"{path}: {error}{_OTHER_SUFFIX}") from error
     try:
         value = read_toml(path, at_most=MAX_BYTES, expected="a task")
         check_keys("", value, TaskFileTable, needed=("instruction", "goal", "objects"))
-        return _task(path, convert(value, TaskFileTable, _ROOT))
+        return _task(path, record_of(value, TaskFileTable, _ROOT))
     except TomlFileError as error:
         raise ProblemSourceError(str(error)) from error
     except SceneInvalidError as error:
@@ -153,8 +156,8 @@ def _fact(name: str, text: str, types: Mapping[str, str]) -> InitLiteral:
     if not isinstance(fact, Atom):
         raise wrong(key, repr(text[:60]), example)
     if fact.predicate == Relation.INROOM and not _is_room(fact.args[-1]):
-        hint = close_to(fact.args[-1].rstrip("_0123456789"), ROOM_TYPES)
-        raise wrong(key, repr(text[:60]), f"a room type such as kitchen, or a room such as kitchen_0; {hint}")
+        expected = "a room type such as kitchen, or a room such as kitchen_0"
+        raise wrong_room(key, fact.args[-1], repr(text[:60]), expected)
     return InitLiteral(fact, positive)
 
 
