@@ -15,7 +15,8 @@ from embomatrix.worker.commands.app import app
 from embomatrix.worker.commands.install import closed_to_others, quote, unit_text
 from embomatrix.worker.commands.run import settings_of
 from embomatrix.worker.commands.status import describe, format_duration
-from embomatrix.worker.link.status import StatusFile, WorkerStatus, running_daemons
+from embomatrix.worker.link.membership import Membership
+from embomatrix.worker.link.status import StatusFile, WorkerStatus, refuse_second_daemon, running_daemons
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 STATUS = WorkerStatus("w1", os.getpid(), time.time(), slots=4, memory_mb=2000, cache_mb=1024)
@@ -111,6 +112,38 @@ def test_status_files_of_killed_daemons_are_ignored(tmp_path):
     (tmp_path / "running" / "odd.json").write_text('{"name": 1}')
     StatusFile(tmp_path, "w1").write(STATUS)
     assert running_daemons(tmp_path) == [STATUS]
+
+
+@pytest.fixture
+def other_process():
+    """Process that runs until the test ends."""
+    process = subprocess.Popen(["sleep", "60"])
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_second_worker_of_one_name_is_refused_before_it_ends_the_session_of_the_first(
+    tmp_path, other_process
+):
+    StatusFile(tmp_path, "w1").write(WorkerStatus("w1", other_process.pid, time.time(), manager="A:1"))
+    arguments = ["run", f"--state-dir={tmp_path}", "--name=w1", "--manager=A:1,B:1"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    said = " ".join(result.stderr.split())
+    assert f"worker 'w1' runs on this machine already (process {other_process.pid})" in said
+    assert "stop that one, or give this one another --name" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "manager", "process"), [("w2", "A:1", "other"), ("w1", "B:1", "other"), ("w1", "A:1", "own")]
+)
+def test_only_another_daemon_of_that_name_and_manager_is_refused(
+    tmp_path, other_process, name, manager, process
+):
+    pid = os.getpid() if process == "own" else other_process.pid
+    StatusFile(tmp_path, "w1").write(WorkerStatus("w1", pid, time.time(), manager="A:1"))
+    refuse_second_daemon(tmp_path, Membership(manager, name), remedy="give this one another --name")
 
 
 def test_unwritable_status_file_is_no_error(tmp_path):

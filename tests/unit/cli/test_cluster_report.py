@@ -3,6 +3,7 @@
 import re
 from html.parser import HTMLParser
 
+from embomatrix.cli.cluster.charts import throughput_chart
 from embomatrix.cli.cluster.report import report_page, seconds_text
 from embomatrix.rpc.wire.run_log import (
     EventKind,
@@ -112,6 +113,23 @@ def test_report_shows_the_counted_figures():
     assert "Manager overhead 25 %" in words
     assert "lease failed slot_crashed 2 x9 office 01234567" in words
     assert "All 3 events of the run are kept." in words
+
+
+def test_failures_of_one_cause_share_a_row_with_the_latest_of_them():
+    (first,) = summary().failures
+    later = [first._replace(at_s=1_010.0 + n, rollout_id=f"y{n}") for n in range(1, 4)]
+    other = first._replace(message="signal 11")
+    page = report_page(summary(failures=(first, other, *later)), EVENTS)
+    words = " ".join(re.sub(r"<[^>]*>", " ", page).split())
+    assert "Latest: 5 failed leases, with the reasons slot_crashed (5)." in words
+    assert "00:16:53 lease failed slot_crashed 2 y3 and 3 more office" in words
+    assert page.count('<tr class="failure">') == 2
+
+
+def test_times_of_a_chart_have_simple_ticks():
+    svg = throughput_chart(RunSeries(5.0, (1,) * 172, (0,) * 172))  # 14.3 minutes
+    assert "min since the run was opened" in svg
+    assert re.findall(r">(\d+\.\d{3,})</text>", svg) == []
 
 
 def test_empty_run_has_a_report():

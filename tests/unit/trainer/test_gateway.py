@@ -7,12 +7,19 @@ import time
 import pytest
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import DeadlineError, ManagerUnreachableError, UnavailableError
 from embomatrix.rpc.traffic import TrafficError, TrafficLog, read_traffic
-from embomatrix.rpc.wire.values import RunTerms
+from embomatrix.rpc.wire.values import Cancelled, InfraCode, InfraFailure, RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
-from embomatrix.trainer.cluster.gateway import Gateway, PlanGroup, result_of
+from embomatrix.trainer.cluster.gateway import (
+    Gateway,
+    PlanGroup,
+    PlanOutcome,
+    refuse_without_workers,
+    result_of,
+)
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import evaluation_seed, training_seed
 
@@ -65,6 +72,29 @@ def test_reward_coefficients_apply_to_executed_and_unparsable_plans():
     none, failed = outcomes(cluster, "no idea", "toggle_on countertop", terms=terms)
     assert cluster.terms == terms
     assert (none.value, failed.value) == (-7.0, 2.0)
+
+
+ABSENT = "no worker took work for 60 s, none is there: start one with `embomatrix worker run`"
+
+
+def lost(code):
+    return PlanOutcome(ORACLE, None, InfraFailure(code, ABSENT))
+
+
+def test_work_that_no_worker_took_is_refused_with_the_remedies():
+    cancelled = PlanOutcome(ORACLE, None, Cancelled())
+    unparsable = PlanOutcome("no idea", RewardBreakdown(-1.0, 0.0, 0.0, (), success=False), problem="no plan")
+    with pytest.raises(TrainerError) as raised:
+        refuse_without_workers([unparsable, cancelled, lost(InfraCode.NO_CAPACITY)], "step 7")
+    assert str(raised.value).startswith(f"none of the 2 rollouts of step 7 has a result: {ABSENT}")
+    assert "--resume" in str(raised.value)
+
+
+def test_work_with_a_result_or_another_loss_is_accepted():
+    (kept,) = outcomes(SymbolicCluster(TASKS), ORACLE)
+    refuse_without_workers([kept, lost(InfraCode.NO_CAPACITY)], "step 7")
+    refuse_without_workers([lost(InfraCode.SCENE_LOAD_FAILED)], "step 7")
+    refuse_without_workers([], "step 7")
 
 
 def test_lost_rollout_has_no_reward():

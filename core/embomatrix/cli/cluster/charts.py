@@ -5,7 +5,7 @@ from typing import Final
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator
 
 from embomatrix.pages.charts import BAD, GOOD, SECOND, STYLE, add_legend, new_chart, svg_of
 from embomatrix.rpc.wire.run_log import PhaseSummary, RolloutPhase, RunSeries
@@ -77,6 +77,10 @@ def _times(axes: Axes, steps: int, step_s: float) -> list[float]:
     """Return the start of each step in seconds, and label the axis in a fitting unit."""
     whole_s = max(steps, 1) * step_s
     unit, name = (3600.0, "h") if whole_s > 3 * 3600 else (60.0, "min") if whole_s > 180 else (1.0, "s")
+    # Ticks at whole numbers of the unit, or at simple fractions of it: 0.5 min, not 1.66667 min.
+    axes.xaxis.set_major_locator(
+        FixedLocator([at * unit for at in MaxNLocator(8).tick_values(0, whole_s / unit)])
+    )
     axes.xaxis.set_major_formatter(FuncFormatter(lambda at_s, _: f"{at_s / unit:g}"))
     axes.set_xlabel(f"{name} since the run was opened")
     axes.set_xlim(0, whole_s)

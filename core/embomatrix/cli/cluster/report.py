@@ -194,8 +194,12 @@ def _failures(summary: RunSummary) -> str:
         return '<p class="none">None: every lease brought a result.</p>'
     codes = Counter(event.code for event in summary.failures)
     counts = ", ".join(f"{code} ({count})" for code, count in codes.most_common())
-    rows = "".join(map(_failure_row, reversed(summary.failures)))
-    names = ("time (UTC)", "what", "reason", "attempt", "rollout", "worker", "scene")
+    alike: dict[tuple[object, ...], list[RunEvent]] = {}
+    for event in reversed(summary.failures):
+        cause = (event.kind, event.code, event.attempt, event.worker_id, event.bundle_digest, event.message)
+        alike.setdefault(cause, []).append(event)
+    rows = "".join(_failure_row(events[0], len(events)) for events in alike.values())
+    names = ("latest (UTC)", "what", "reason", "attempt", "rollout", "worker", "scene")
     head = "".join(f"<th>{name}</th>" for name in names)
     table = f"<table><tr>{head}</tr>{rows}</table>"
     attempts = sum(event.kind is EventKind.FAILED for event in summary.failures)
@@ -209,12 +213,13 @@ def _failures(summary: RunSummary) -> str:
     return f'<p class="note">{escape(latest)}</p><div class="scroll">{table}</div>'
 
 
-def _failure_row(event: RunEvent) -> str:
-    """Return two rows: the failure, and its message."""
+def _failure_row(event: RunEvent, count: int) -> str:
+    """Return two rows: the latest of ``count`` failures of one cause, and its message."""
     what = "lease failed" if event.kind is EventKind.FAILED else "rollout given up"
     at = time.strftime("%H:%M:%S", time.gmtime(event.at_s))
     scene = event.bundle_digest.removeprefix("sha256:")[:8] or NONE
-    words = (at, what, event.code, str(event.attempt), event.rollout_id, event.worker_id or NONE, scene)
+    rollout = event.rollout_id if count == 1 else f"{event.rollout_id} and {count - 1:,} more"
+    words = (at, what, event.code, str(event.attempt), rollout, event.worker_id or NONE, scene)
     cells = "".join(f"<td>{escape(word)}</td>" for word in words)
     message = f'<tr class="words"><td colspan="{len(words)}">{escape(event.message)}</td></tr>'
     return f'<tr class="failure">{cells}</tr>{message}'

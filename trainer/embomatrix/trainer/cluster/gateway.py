@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -27,6 +27,7 @@ from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,
+    InfraCode,
     InfraFailure,
     LookaheadEntry,
     Outcome,
@@ -364,6 +365,23 @@ def _plan_outcome(text: str, outcome: Outcome | None) -> PlanOutcome:
     if isinstance(outcome, Completed):
         return PlanOutcome(text, outcome.reward, outcome)
     return PlanOutcome(text, None, outcome)
+
+
+def refuse_without_workers(outcomes: Iterable[PlanOutcome], activity: str) -> None:
+    """Raise TrainerError if every submitted rollout was lost, and any of them because no worker took it.
+
+    Without this check a run would spend its budget while it learns nothing. ``activity`` names the outcomes in the message.
+    """
+    submitted = [each for each in outcomes if not each.problem]
+    if any(each.reward is not None for each in submitted):
+        return
+    failures = [each.outcome for each in submitted if isinstance(each.outcome, InfraFailure)]
+    for failure in failures:
+        if failure.code is InfraCode.NO_CAPACITY:
+            raise TrainerError(
+                f"none of the {len(submitted)} rollouts of {activity} has a result: {failure.message}. Then continue the "
+                "run with --resume and the same --out"
+            )
 
 
 def result_of(future: Future[T]) -> T:

@@ -6,9 +6,10 @@ Samples of one task are not independent, so intervals come from a bootstrap over
 from __future__ import annotations
 
 import functools
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from embomatrix.trainer.cluster.gateway import (
     PlanGroup,
     PlanOutcome,
     parse_policy_text,
+    refuse_without_workers,
     result_of,
 )
 from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
@@ -90,7 +92,7 @@ def improvement(before: HeldOutEvaluation, after: HeldOutEvaluation) -> Interval
     return paired_difference(earlier, later)
 
 
-_Pending = tuple[PlanGroup, Future[tuple[PlanOutcome, ...]]]
+_Submitted = tuple[PlanGroup, Future[tuple[PlanOutcome, ...]]]
 
 
 def evaluate_policy(
@@ -108,15 +110,17 @@ def evaluate_policy(
 ) -> HeldOutEvaluation:
     """Sample plans of each task and execute each once. ``report`` gets finished and total tasks.
 
-    A chunk of tasks has its own seed, so its plans are the same in whichever process they are sampled.
+    A chunk of tasks has its own seed, so its plans are the same in whichever process they are sampled. Raises TrainerError if
+    the cluster failed, or no worker took any plan.
     """
     codec, rule = workers.local.policy.codec, SamplingRule(samples, settings.temperature, max_new)
     chunks = [tasks[at : at + settings.chunk] for at in range(0, len(tasks), settings.chunk)]
     gateway.announce(dict(enumerate(chunks)), samples)
+    # Without this report a display would show the phase before until the first plans are sampled and executed.
+    report(0, len(tasks))
+    collected = _Collected(codec, lambda done: report(done, len(tasks)))
 
-    def sample(
-        number: int, chunk: Sequence[TrainingTask], learner: Learner | RemoteLearner
-    ) -> list[_Pending]:
+    def sample(number: int, chunk: Sequence[TrainingTask], learner: Learner | RemoteLearner) -> None:
         prompts = [prompt_builder.plain(task) for task in chunk]
         drawn = learner.sample([prompt.tokens for prompt in prompts], _seed_of(seed, number), rule)
         groups = [
@@ -128,18 +132,53 @@ def evaluate_policy(
             )
             for row, (task, prompt) in enumerate(zip(chunk, prompts, strict=True))
         ]
-        return list(zip(groups, gateway.submit(f"{label}-{number}", number, groups, codec), strict=True))
+        futures = gateway.submit(f"{label}-{number}", number, groups, codec)
+        collected.submitted[number] = deque(zip(groups, futures, strict=True))
+        if learner is workers.local:  # on the thread of the caller
+            collected.take_finished()
 
-    jobs = [(number, functools.partial(sample, number, chunk)) for number, chunk in enumerate(chunks)]
-    pending = [each for sampled in workers.map(jobs) for each in sampled]
-    scores: list[TaskScore] = []
-    answers: list[HeldOutAnswer] = []
-    for group, future in pending:
-        outcomes: tuple[PlanOutcome, ...] = result_of(future)
-        scores.append(_task_score(group.task, outcomes))
-        answers += [_answer(group, codec, sample, outcome) for sample, outcome in enumerate(outcomes)]
-        report(len(scores), len(tasks))
-    return HeldOutEvaluation(tuple(scores), tuple(answers))
+    workers.map([(number, functools.partial(sample, number, chunk)) for number, chunk in enumerate(chunks)])
+    collected.take_all()
+    refuse_without_workers(collected.outcomes, f"the evaluation on {len(tasks)} tasks")
+    return HeldOutEvaluation(tuple(collected.scores), tuple(collected.answers))
+
+
+@dataclass(slots=True)
+class _Collected:
+    """Groups whose outcomes were not taken yet, by chunk, and scores and answers of the others, in the order of the chunks."""
+
+    codec: Codec
+    report: Callable[[int], None]
+    """Gets the number of tasks whose outcomes were taken."""
+    submitted: dict[int, deque[_Submitted]] = field(default_factory=dict)
+    chunk: int = 0
+    """Chunk whose outcomes are taken next."""
+    outcomes: list[PlanOutcome] = field(default_factory=list)
+    scores: list[TaskScore] = field(default_factory=list)
+    answers: list[HeldOutAnswer] = field(default_factory=list)
+
+    def take_finished(self) -> None:
+        """Take the outcomes of the oldest groups that are executed, without waiting."""
+        while self.chunk in self.submitted:
+            groups = self.submitted[self.chunk]
+            while groups and groups[0][1].done():
+                self._take(*groups.popleft())
+            if groups:
+                return
+            self.chunk += 1
+
+    def take_all(self) -> None:
+        """Wait for the outcomes of all groups and take them. Every chunk must be submitted."""
+        for number in range(self.chunk, len(self.submitted)):
+            for group, future in self.submitted[number]:
+                self._take(group, future)
+
+    def _take(self, group: PlanGroup, future: Future[tuple[PlanOutcome, ...]]) -> None:
+        outcomes = result_of(future)
+        self.outcomes += outcomes
+        self.scores.append(_task_score(group.task, outcomes))
+        self.answers += [_answer(group, self.codec, sample, each) for sample, each in enumerate(outcomes)]
+        self.report(len(self.scores))
 
 
 def _seed_of(seed: int, chunk: int) -> int:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter
+from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter, refuse_without_workers
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, Overlap
 from embomatrix.trainer.data.tasks import TrainingTask
@@ -104,7 +104,7 @@ class Updater:
     ) -> tuple[StepRecord, list[GroupLog]]:
         """Sample, execute and learn from one batch of tasks. Ctrl-C is deferred while the weights change.
 
-        Raises TrainerError if the cluster or a process failed, or the gradients stay non-finite.
+        Raises TrainerError if the cluster or a process failed, no worker took a rollout, or the gradients stay non-finite.
         """
         settings = self._settings
         with self._stopwatch.track(Activity.SAMPLING):
@@ -115,6 +115,8 @@ class Updater:
         take = self._learn_all if streams else self._score_all
         take(chunks, state)
         self._replace_zero_variance(len(chunks), state, take)
+        outcomes = (outcome for group in state.groups for outcome in group.log.outcomes)
+        refuse_without_workers(outcomes, f"step {plan.step}")
         with self._stopwatch.track(Activity.UPDATE):
             if interrupts is not None:
                 interrupts.defer()

@@ -50,7 +50,9 @@ class LineDisplay:
         self._show(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})
 
     def evaluated(self, label: str, result: HeldOutEvaluation) -> None:
-        self._print(f"held-out success {label}: {result.success().as_percent()}")
+        lost = sum(score.lost for score in result.scores)
+        note = f"; {lost} rollouts without a result are left out" if lost else ""
+        self._print(f"held-out success {label}: {result.success().as_percent()}{note}")
 
     def stepped(self, record: StepRecord, share: float, rollouts_per_s: float) -> None:
         figures = {
@@ -63,6 +65,8 @@ class LineDisplay:
             "entropy": "–" if record.entropy is None else f"{record.entropy:.2f}",
             "zero-variance groups": f"{record.zero_variance_groups:.0%}",
         }
+        if record.lost:
+            figures["lost rollouts"] = f"{record.lost} of {record.rollouts}"
         if record.cut_off:
             figures["cut-off plans"] = f"{record.cut_off:.1%}"
         self._clock.note(Phase.GRPO, share, time.monotonic())
@@ -89,7 +93,8 @@ class LineDisplay:
             )
 
     def _print(self, text: str) -> None:
-        self._console.print(text, highlight=False, markup=False)
+        # A line of a log stays one line, however wide.
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 class LiveDisplay(LineDisplay):

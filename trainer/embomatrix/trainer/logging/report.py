@@ -188,7 +188,7 @@ def _held_out_curve(evaluations: Sequence[RecordedEvaluation], tasks: TaskSet) -
     points = [(each.step, each.board(categories).success().interval) for each in evaluations if each.answers]
     return (
         "<section class='curve'><h2>Held-out success during GRPO</h2>"
-        f"<div class='scroll'>{success_curve(points)}</div></section>"
+        f"<div class='chart'>{success_curve(points)}</div></section>"
         if len(points) > 2
         else ""
     )
@@ -200,21 +200,20 @@ def _causes(before: RecordedEvaluation | None, after: RecordedEvaluation | None,
         return ""
     boards = [each.board(_categories(tasks)) for each in (before, after)]
     counts = [board.causes() for board in boards]
-    rows = [
-        (
-            cause.replace("_", " "),
-            *(
-                f"{found[cause] / max(1, board.samples - board.lost):.1%}"
-                for board, found in zip(boards, counts, strict=True)
-            ),
-            MEANINGS[cause],
-        )
-        for cause in Cause
-        if any(found[cause] for found in counts)
-    ]
-    if not rows:
+    causes = [cause for cause in Cause if any(found[cause] for found in counts)]
+    if not causes:
         return ""
-    table = html_table([("cause", "before GRPO", "after GRPO", "meaning"), *rows])
+    # The meaning stands below the name, so that a phone shows all columns.
+    rows = "".join(
+        f"<tr><td>{cause.replace('_', ' ')}<small>{html.escape(MEANINGS[cause])}</small></td>"
+        + "".join(
+            f"<td>{found[cause] / max(1, board.samples - board.lost):.1%}</td>"
+            for board, found in zip(boards, counts, strict=True)
+        )
+        + "</tr>"
+        for cause in causes
+    )
+    table = f"<table><tr><th>cause</th><th>before GRPO</th><th>after GRPO</th></tr>{rows}</table>"
     note = "Shares of all plans; the first failure of a plan counts."
     return f"<section><h2>Why held-out plans failed</h2>{table}<p>{note}</p></section>"
 
@@ -243,7 +242,7 @@ def _drawn(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _section_of_curve(curve: str) -> str:
-    return f'<section class="half"><div class="scroll">{curve}</div></section>'
+    return f'<section class="half"><div class="chart">{curve}</div></section>'
 
 
 def _times(outcome: RunOutcome) -> str:

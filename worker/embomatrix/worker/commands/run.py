@@ -35,7 +35,7 @@ from embomatrix.worker.host.resources import measure
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.daemon import Daemon, serve
 from embomatrix.worker.link.membership import membership_of
-from embomatrix.worker.link.status import daemon_pids
+from embomatrix.worker.link.status import daemon_pids, refuse_second_daemon
 from embomatrix.worker.slots.processes import ProcessGoneError
 
 logger = logging.getLogger(__name__)
@@ -138,6 +138,10 @@ async def _serve(settings: WorkerSettings) -> None:
     tail = LogTail(kept=LINES_KEPT, characters=LOG_LINE)
     logging.getLogger("embomatrix").addHandler(tail)
     membership = await membership_of(settings)
+    remedy = (
+        "join this one with an invitation of its own" if settings.join else "give this one another --name"
+    )
+    refuse_second_daemon(settings.state_dir, membership, remedy=remedy)
     bind("worker", membership.name)
     machine = HostMachine(lambda: daemon_pids(settings.state_dir))
     if not settings.preferences.always:

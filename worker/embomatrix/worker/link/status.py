@@ -15,6 +15,8 @@ from typing import Final
 import msgspec
 import psutil
 
+from embomatrix.rpc.status import InvalidRequestError
+from embomatrix.worker.link.membership import Membership
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
@@ -105,6 +107,20 @@ def running_daemons(state_dir: Path) -> list[WorkerStatus]:
 def daemon_pids(state_dir: Path) -> set[int]:
     """Process ids of all daemons of this folder, and of this process."""
     return {os.getpid(), *(status.pid for status in running_daemons(state_dir))}
+
+
+def refuse_second_daemon(state_dir: Path, membership: Membership, *, remedy: str) -> None:
+    """Raise InvalidRequestError if another daemon of this folder has the name at the same manager.
+
+    Each of the two would end the other's session. ``remedy`` says what to do instead of stopping the first one.
+    """
+    managers = membership.manager.split(",")
+    for status in running_daemons(state_dir):
+        if status.name == membership.name and status.manager in managers and status.pid != os.getpid():
+            raise InvalidRequestError(
+                f"worker {status.name!r} runs on this machine already (process {status.pid}), and one worker uses all "
+                f"slots: stop that one, or {remedy}"
+            )
 
 
 def _runs(status: WorkerStatus) -> bool:

@@ -69,7 +69,7 @@ async function refresh(first = null) {
     if (asked === page) {
       showOverview(snapshot);
       await page.show(snapshot);
-      at("dot").className = "dot ready";
+      at("dot").className = snapshot.health.mood === "bad" ? "dot lost" : "dot ready";
       at("main").classList.remove("old");
       learn(); // scene names must not delay the first view
     }

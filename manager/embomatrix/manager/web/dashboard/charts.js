@@ -10,6 +10,8 @@ await Promise.all([
 const DASHES = [[], [6, 3], [2, 2], [9, 3, 2, 3], [1, 4]];
 /** Tick intervals: steps and seconds are whole numbers. */
 const WHOLE = [1, 2, 5].flatMap(n => [0, 1, 2, 3, 4, 5, 6].map(power => n * 10 ** power)).sort((a, b) => a - b);
+/** Tick intervals of times in seconds: whole numbers of the unit in which they are written. */
+const TIMES = [1, 2, 5, 10, 20, 60, 120, 300, 600, 1200, 3600, 7200, 18000, 36000, 86400, 172800, 432000];
 /** Smaller values are rounding errors and shown as 0. */
 const LEAST = 1e-6;
 const TINTS = ["c1", "c2", "c3", "c4", "c5"];
@@ -21,7 +23,7 @@ function latest(drawn) {
 
 /** A chart in an element. `lines` are the names of the series; `words` formats the ticks of the x axis, `across` names it and `steps` are its intervals; `most` is the
  * end of the y axis; `fill` fills a single line. */
-export function chart(place, lines, {high = 190, words, across = "step", steps = WHOLE, most: end, fill = false, legend = true} = {}) {
+export function chart(place, lines, {high = 190, words, across = "step", steps = words ? TIMES : WHOLE, most: end, fill = false, legend = true} = {}) {
   const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
   const series = lines.map((label, i) => ({
     label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], spanGaps: true,

@@ -28,8 +28,8 @@ export async function show({overview, runs}) {
   put(at("blamed"), tally("worker", given.map(note => [note.worker_id || "none", note.count]), lost.map(event => [event.worker_id || "none", 1])));
   const listed = given.reduce((sum, note) => sum + note.count, 0);
   at("listed").textContent = listed < overview.failed ? `the latest ${count(listed)} of ${count(overview.failed)}` : "";
-  const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id, note.count > 1 && h("span", {class: "muted"}, ` and ${counted(note.count - 1, "equal one")}`)), h("td", {class: "message"}, worded(note.message))));
-  put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "message"], rows, "failures", "loose") : none("None. A rollout counts as failed only after its last attempt."));
+  const rows = merged(given).map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id, note.count > 1 && h("span", {class: "muted"}, ` and ${count(note.count - 1)} more`)), h("td", {class: "message"}, worded(note.message))));
+  put(at("failures"), rows.length ? table(["latest", "reason", "worker", "rollout", "message"], rows, "failures", "loose") : none("None. A rollout counts as failed only after its last attempt."));
   const every = fold(lost);
   const folded = every.slice(0, ROWS).map(({event, times}) =>
     h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind), times > 1 && ` × ${count(times)}`), h("td", {class: "named"}, event.worker_id),
@@ -45,6 +45,17 @@ async function look(runs) {
   if (fleet.length) after = fleet.at(-1).sequence;
   log = [...log, ...fleet.filter(event => BAD.includes(event.kind))].slice(-KEPT);
   return [...log, ...pages.slice(1).flatMap(page => page.events)].sort((a, b) => b.at_s - a.at_s).slice(0, KEPT);
+}
+
+/** Merge failures of one reason, worker and message into the latest of them. */
+function merged(notes) {
+  const rows = new Map();
+  for (const note of notes) {
+    const said = JSON.stringify([note.code, note.worker_id, note.message]);
+    if (rows.has(said)) rows.get(said).count += note.count;
+    else rows.set(said, {...note});
+  }
+  return [...rows.values()];
 }
 
 /** Merge repeated events into one row. */
