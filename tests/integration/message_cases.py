@@ -351,6 +351,24 @@ COMMANDS = (
         "expected a text file",
     ),
     CommandCase(
+        "plan file that is no text",
+        "play apple_to_counter --dataset=KITCHEN --plan=FILES/binary.bddl",
+        "FILES/binary.bddl",
+        "expected a text file with JSON or one call a line",
+    ),
+    CommandCase(
+        "file in place of a dataset",
+        "play apple_to_counter --oracle --dataset=FILES/report.json",
+        "FILES/report.json is a file",
+        "expected the folder of a dataset",
+    ),
+    CommandCase(
+        "file that is no scene",
+        "scene draw FILES/mesh.obj --out=FILES/new",
+        "FILES/mesh.obj is no scene",
+        "expected the name of a base scene, or a file that ends in",
+    ),
+    CommandCase(
         "import over a dataset",
         "factory import --bddl=FILES/problem.bddl --out=KITCHEN",
         "KITCHEN",
