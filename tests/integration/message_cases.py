@@ -363,6 +363,12 @@ COMMANDS = (
         "expected the folder of a dataset",
     ),
     CommandCase(
+        "word that no category has",
+        "factory assets list xyzzy",
+        "'xyzzy'",
+        "try a shorter or a more general word",
+    ),
+    CommandCase(
         "file that is no scene",
         "scene draw FILES/mesh.obj --out=FILES/new",
         "FILES/mesh.obj is no scene",

@@ -153,3 +153,16 @@ def test_check_prints_the_rules_and_names_an_unknown_category() -> None:
     unknown = CliRunner().invoke(app, ["check", "--category", "frigde"])
     assert unknown.exit_code == 2
     assert "did you mean fridge" in unknown.output
+
+
+def test_categories_are_listed_by_name_and_by_kind():
+    by_name = CliRunner().invoke(app, ["list", "cabinet"], env={"COLUMNS": "80"})
+    assert "bottom_cabinet_no_top" in by_name.output
+    assert "locker" in by_name.output  # a kind of cabinet
+    assert "opens" in by_name.output
+    assert max(map(len, by_name.output.splitlines())) <= 80
+    by_words = CliRunner().invoke(app, ["list", "coffee table"])
+    assert "coffee_table" in by_words.output
+    every = CliRunner().invoke(app, ["list"])
+    count = len(Catalog.load().category_names)
+    assert f"{count:,} of {count:,} categories" in every.output

@@ -1,5 +1,6 @@
-"""``embomatrix factory assets``: test the generated assets, look at them, and import models from files."""
+"""``embomatrix factory assets``: list the catalog, test the generated assets, draw them, and import models from files."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from enum import StrEnum
@@ -7,25 +8,39 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
+from rich.table import Column
 
 from embomatrix.factory.assets.check import AssetRule, check_asset, check_standing
 from embomatrix.factory.assets.library import build_asset, family_of
-from embomatrix.factory.commands.terminal import say, show_table, user_errors
+from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
 from embomatrix.factory.importers.assemble import ImportedAsset, import_model, read_model
 from embomatrix.factory.importers.convex import Coacd, by_components
 from embomatrix.factory.importers.model import AxisConvention, ModelFileError
 from embomatrix.factory.importers.shelf import ASSET_MARK, asset_file, save_asset
 from embomatrix.factory.pictures.assets import draw_sheet
 from embomatrix.factory.pictures.marked_files import write_picture
+from embomatrix.factory.task_import.task_file import SENSES
 from embomatrix.host.commands import command_group
 from embomatrix.host.own_files import PICTURE_MARK, Force, keep_foreign, prepare_output
 from embomatrix.world.asset import Asset, Credit
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.records import SceneInvalidError
 
-app = command_group(help="Test, draw and import the models that scenes are built from.")
+app = command_group(help="List, test, draw and import the models that scenes are built from.")
 WORTH_TELLING: Final = 1.25
 """Ratio of the largest to the smallest scale from which a distorted model is reported."""
+ABILITIES: Final = {
+    "openable": "opens",
+    "toggleable": "switches on",
+    "heatSource": "heats",
+    "coldSource": "cools",
+    "waterSource": "gives water",
+    "particleRemover": "cleans",
+    "slicer": "cuts",
+    "sliceable": "can be cut",
+    "cookable": "can be cooked",
+}
+"""Abilities in words, by their names in the catalog. Others matter to no skill."""
 
 
 class Cut(StrEnum):
@@ -36,6 +51,36 @@ class Cut(StrEnum):
 
 
 Categories = Annotated[list[str] | None, typer.Option("--category", help="Only this category; repeatable.")]
+
+
+@app.command("list")
+def list_(
+    word: Annotated[
+        str,
+        typer.Argument(help="Part of a name such as cabinet, or a kind such as fruit. Default: everything."),
+    ] = "",
+) -> None:
+    """List the catalog's categories of objects, whose names task files, floor plans and `assets import` use.
+
+    Sizes are those of the middle model by volume: depth, width and height.
+    """
+    catalog = Catalog.load()
+    with user_errors():
+        found = _categories_like(catalog, word)
+    if not found:
+        fail(
+            f"no category of the catalog has {word!r} in its name, or is a kind of it: try a shorter or a more general word"
+        )
+    rows = [_described(catalog, name) for name in found]
+    columns: list[str | Column] = [
+        Column("category", no_wrap=True),
+        Column("models", justify="right"),
+        Column("cm", justify="right", no_wrap=True),
+        Column("kg", justify="right"),
+        "abilities",
+    ]
+    show_table(columns, rows)
+    say(f"{len(found):,} of {len(catalog.category_names):,} categories")
 
 
 @app.command()
@@ -121,6 +166,27 @@ def import_(
         path = save_asset(out, imported.asset)
     _tell(imported, path)
     say(_stands_in(imported.asset.asset_id))
+
+
+def _categories_like(catalog: Catalog, word: str) -> list[str]:
+    """Return the categories with the word in their names, and those that a synset of this name includes."""
+    part = word.lower().replace(" ", "_")
+    kinds = {
+        name
+        for sense in SENSES
+        if part and catalog.has_synset(f"{part}.{sense}")
+        for name in catalog.categories_of(f"{part}.{sense}")
+    }
+    return [name for name in catalog.category_names if part in name or name in kinds]
+
+
+def _described(catalog: Catalog, name: str) -> tuple[str, str, str, str, str]:
+    """Return the row of a category: name, models, size, mass and abilities."""
+    category, models = catalog.category(name), catalog.models_of(name)
+    middle = sorted(models, key=lambda model: math.prod(model.size_m))[len(models) // 2]
+    size = " × ".join(f"{100 * side:.0f}" for side in middle.size_m)
+    abilities = ", ".join(words for ability, words in ABILITIES.items() if ability in category.abilities)
+    return name, str(len(models)), size, f"{category.mass_kg:g}", abilities
 
 
 def _tell(imported: ImportedAsset, path: Path) -> None:
