@@ -3,6 +3,7 @@
 import torch
 
 from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.prompts import plan_text
 
 
@@ -42,3 +43,9 @@ def random_llama(tokenizer, seed=0):
         for parameter in model.parameters():  # far from uniform, so that differences would show
             parameter.mul_(6 if parameter.dim() > 1 else 1)
     return model
+
+
+def save_small_llama(tasks, folder):
+    """Save a random Llama whose tokenizer knows the words of these tasks."""
+    tokenizer = word_tokenizer(tasks)
+    HfPolicy(random_llama(tokenizer), tokenizer, Codec.LINES, "random llama").save(folder)

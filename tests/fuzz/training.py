@@ -6,7 +6,8 @@ import functools
 import io
 import json
 import random
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import msgspec
 import torch
@@ -16,7 +17,7 @@ from embomatrix.cli.evaluate import read_eval_settings
 from embomatrix.rpc.traffic import SubmittedGroup, TrafficError, read_traffic
 from embomatrix.trainer.commands.eai import _read as read_eai_answers
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import TrainSettings, read_settings
+from embomatrix.trainer.config.settings import ServerKind, TrainSettings, read_settings
 from embomatrix.trainer.eai.sanitise import sanitise_answer
 from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
 from embomatrix.trainer.evaluation.answers import _read as read_answers
@@ -30,7 +31,27 @@ from embomatrix.trainer.policy.hf import CODEC_KEY, CONFIG, HfPolicy
 from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import build_vocabulary
+from embomatrix.trainer.serving.forms import (
+    FORMS,
+    AbortedError,
+    AnswerError,
+    OldWeightsError,
+    PlanRequest,
+    Weights,
+)
+from embomatrix.trainer.serving.server import served_models
 
+_FOLDER = Path("weights")
+_ADAPTERS = Weights("run-1", _FOLDER, are_adapters=True)
+_WANTED = PlanRequest(((1, 2),), 1, 1.0, 4, (2,), 0)
+_COMPLETIONS = (
+    b'{"choices": [{"index": 0, "text": "a", "finish_reason": "stop", "token_ids": [4, 2], "logprobs": {"tokens":'
+    b' ["token_id:4", "token_id:2"], "token_logprobs": [-0.5, -0.25]}}]}'
+)
+_GENERATIONS = (
+    b'[{"text": "a", "meta_info": {"finish_reason": {"type": "stop", "matched": 2}, "weight_version": "run-1",'
+    b' "output_token_logprobs": [[-0.5, 4, null], [-0.25, 2, null]]}}]'
+)
 TRAIN_TOML = b"""model = "tiny"
 seed = 3
 [tiny]
@@ -246,6 +267,29 @@ def table() -> dict[str, Decoder]:
             lambda: (b'{"step": 1}\n{"step": 4}\n{"step": 2', b"1\n[]\n{}\n"),
             frozenset({"trainer.logging.recorder:_step_of"}),
             mutate_json_lines,
+        ),
+        "plans of vLLM": Decoder(
+            lambda data: FORMS[ServerKind.VLLM].plans(data, _WANTED, _ADAPTERS),
+            (AnswerError, AbortedError),
+            lambda: (_COMPLETIONS, _COMPLETIONS.replace(b'"token_ids": [4, 2], ', b"")),
+            frozenset({"trainer.serving.forms:VllmForm.plans"}),
+            mutate_json,
+        ),
+        "plans of SGLang": Decoder(
+            lambda data: FORMS[ServerKind.SGLANG].plans(
+                data, _WANTED, replace(_ADAPTERS, are_adapters=False)
+            ),
+            (AnswerError, AbortedError, OldWeightsError),
+            lambda: (_GENERATIONS,),
+            frozenset({"trainer.serving.forms:SglangForm.plans"}),
+            mutate_json,
+        ),
+        "models of a model server": Decoder(
+            served_models,
+            (ValueError,),
+            lambda: (b'{"data": [{"id": "m", "max_model_len": 2048, "parent": null}]}',),
+            frozenset({"trainer.serving.server:served_models"}),
+            mutate_json,
         ),
         "answers for EAI": Decoder(
             _eai_answers,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from tests.fakes.scenes import kitchen_scene
+from tests.fakes.small_llama import save_small_llama
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
@@ -24,6 +25,7 @@ from embomatrix.rpc.wire.session import lease_from_proto, resources_from_proto
 from embomatrix.sim.validation import check_scene
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import parse_plan
+from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.codec import scene_from_json, scene_to_json
@@ -110,6 +112,7 @@ _TEXTS = {
     "rate.toml": '[grpo]\nlearning_rate = "fast"\n',
     "minibatches.toml": "[grpo]\ntasks_per_step = 4\nminibatches = 8\n",
     "truncate.toml": "[grpo]\ntruncate_ratio = 2.0\n",
+    "lora.toml": "[lora]\nrank = 2\n",
     "samples.toml": "samples = 0\n",
     "attic.toml": "cache_mbb = 3\n",
     "still.toml": "heartbeat_s = 0\n",
@@ -154,6 +157,7 @@ def write_files(folder: Path, kitchen: Path) -> None:
         shutil.copytree(kitchen, folder / name)
     (folder / "cut_records" / "tasks.jsonl").write_bytes((kitchen / "tasks.jsonl").read_bytes()[:200])
     (folder / "binary_records" / "tasks.jsonl").write_bytes(b"\xff")
+    save_small_llama(load_tasks(kitchen).train, folder / "llama")
     bundle = next((folder / "cut_bundle" / "bundles").iterdir())
     bundle.write_bytes(bundle.read_bytes()[:200])
     next((folder / "no_bundle" / "bundles").iterdir()).unlink()
@@ -668,6 +672,48 @@ COMMANDS = (
         "train --settings=FILES/truncate.toml --dataset=KITCHEN --out=FILES/new",
         "expected grpo.overlap = 'ahead'",
         "leave it out, or change grpo.overlap",
+    ),
+    CommandCase(
+        "model server without http://",
+        "train --sampler-url=localhost:8000 --dataset=KITCHEN --out=FILES/new",
+        "'localhost:8000'",
+        "expected an address such as http://127.0.0.1:8000",
+    ),
+    CommandCase(
+        "unknown kind of model server",
+        "train --sampler-url=http://NOWHERE --sampler-kind=tgi --dataset=KITCHEN --out=FILES/new",
+        "'tgi'",
+        "should be 'vllm' or 'sglang'",
+    ),
+    CommandCase(
+        "model server with data-parallel processes",
+        "train --sampler-url=http://NOWHERE --processes=2 --dataset=KITCHEN --out=FILES/new",
+        "setting 'processes': expected 1 with sampler.url",
+        "leave one of them out",
+    ),
+    CommandCase(
+        "model server for the word-level policy",
+        "train --sampler-url=http://NOWHERE --dataset=KITCHEN --out=FILES/new",
+        "sampler.url",
+        "leave them out",
+    ),
+    CommandCase(
+        "absent model server",
+        "train --model=FILES/llama --settings=FILES/lora.toml --sampler-url=http://NOWHERE --dataset=KITCHEN --out=FILES/new3",
+        "the model server http://127.0.0.1:1: it can't be reached",
+        "start it first, or correct sampler.url",
+    ),
+    CommandCase(
+        "endpoint that is no model server",
+        "train --model=FILES/llama --settings=FILES/lora.toml --sampler-url=URL --dataset=KITCHEN --out=FILES/new3",
+        "it answered 501 to /v1/models",
+        "check sampler.url, sampler.kind and the server's options",
+    ),
+    CommandCase(
+        "whole model on vLLM",
+        "train --model=FILES/llama --sampler-url=http://NOWHERE --dataset=KITCHEN --out=FILES/new3",
+        "sampler.kind: vLLM loads adapters while it runs",
+        "set lora.rank, or serve the model with SGLang",
     ),
     CommandCase(
         "missing settings file",

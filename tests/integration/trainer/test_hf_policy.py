@@ -86,7 +86,7 @@ def test_shared_prompt_gives_the_log_probabilities_of_a_plain_forward_pass(polic
 def test_samples_without_an_end_token_are_cut_off(policy):
     samples = policy.sample(prompts(policy), 8, 1.0, 40, torch.Generator().manual_seed(0))
     for tokens, mask, cut_off in zip(samples.tokens, samples.mask, samples.cut_off.tolist(), strict=True):
-        assert cut_off == (int(tokens[mask][-1]) not in policy._end)
+        assert cut_off == (int(tokens[mask][-1]) not in policy.end_tokens)
     assert 0 < samples.cut_off.sum() < len(samples.cut_off)
 
 

@@ -99,6 +99,20 @@ def test_truncated_importance_sampling_equals_the_formula(kind, ratio):
     assert metrics.kl_to_old != surrogate_loss(inputs(), settings, TOTALS)[1].kl_to_old
 
 
+def test_sampler_gap_is_the_difference_of_log_probabilities_over_unmasked_tokens():
+    exact = surrogate_loss(
+        inputs(sampler_logprobs=torch.tensor(OLD, dtype=torch.float64)), settings_of(), TOTALS
+    )[1]
+    assert (exact.sampler_gap, exact.sampler_gap_max) == (0, 0)
+    sampler = torch.tensor(SAMPLER, dtype=torch.float64)
+    given = inputs(sampler_logprobs=sampler)
+    gaps = (given.old_logprobs - sampler).abs()[given.mask.bool()]
+    metrics = surrogate_loss(given, settings_of(), TOTALS)[1]
+    assert metrics.sampler_gap == pytest.approx(float(gaps.mean()))
+    assert metrics.sampler_gap_max == pytest.approx(float(gaps.max()))
+    assert metrics.sampler_gap > 0
+
+
 def test_truncated_weights_keep_the_gradient_that_the_clipped_ratio_drops():
     good = torch.ones(4, dtype=torch.float64)
     sampler = torch.tensor(OLD, dtype=torch.float64) - 1  # the policy has become e times as sure

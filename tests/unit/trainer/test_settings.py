@@ -3,7 +3,7 @@
 import pytest
 
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.config.settings import SERVER_TRUNCATE_RATIO, read_settings
 
 
 def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
@@ -35,7 +35,7 @@ def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
         ("[grpo]\noverlong = 'drop'", r"'grpo\.overlong': input should be 'keep' or 'mask' \(found 'drop'\)"),
         (
             "[grpo]\ntruncate_ratio = 2",
-            r"'grpo\.truncate_ratio': expected grpo\.overlap = 'ahead' with it, found 'stream', .* \(found 2\)",
+            r"'grpo\.truncate_ratio': expected grpo\.overlap = 'ahead' or sampler\.url .* found 'stream' .* \(found 2\)",
         ),
         (
             "[grpo]\noverlap = 'ahead'\ntruncate_ratio = 0.5",
@@ -44,6 +44,17 @@ def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
         (
             "device = 'cuda'\nprocesses = 2",
             r"'device': expected cpu with processes = 2, .*: set processes to 1, or leave the device out",
+        ),
+        *(
+            (
+                f"[sampler]\nurl = '{url}'",
+                r"'sampler\.url': expected an address such as http://127\.0\.0\.1:8000 \(found '",
+            )
+            for url in ("localhost:8000", "http://", "http://localhost:80000", "http://[::1:8000")
+        ),
+        (
+            "processes = 2\n[sampler]\nurl = 'http://localhost:8000'",
+            r"'processes': expected 1 with sampler\.url, .* \(found 2\): leave one of them out",
         ),
         ("[reward]\ngaol = 3", r"unknown setting 'reward\.gaol': correct its name"),
         ("[reward]\ngoal = -3", r"setting 'reward': .*goal: found -3: expected 0 or more"),
@@ -64,3 +75,12 @@ def test_missing_settings_file_is_reported(tmp_path):
         TrainerError, match=r"can't be read \(No such file or directory\): expected a TOML file"
     ):
         read_settings(tmp_path / "none.toml", {})
+
+
+def test_model_server_turns_truncated_importance_sampling_on():
+    url = "http://localhost:8000/v1/"
+    settings = read_settings(None, {"sampler.url": url})
+    assert settings.sampler.url == "http://localhost:8000"
+    assert settings.grpo.truncate_ratio == SERVER_TRUNCATE_RATIO
+    assert read_settings(None, {"sampler.url": url, "grpo.truncate_ratio": 5}).grpo.truncate_ratio == 5
+    assert read_settings(None, {}).grpo.truncate_ratio is None

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from embomatrix.trainer.logging.report import TrainingSummary
     from embomatrix.trainer.logging.run_clock import RunClock
     from embomatrix.trainer.run.starting import RunStart
+    from embomatrix.trainer.serving.sampler import ServerSampler
 
 
 Connect = Callable[[], ClusterClient]
@@ -94,6 +95,19 @@ def train(
     processes: _PROCESSES = None,
     device: _DEVICE = None,
     track: _TRACK = None,
+    sampler_url: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Address of a vLLM or SGLang server that samples the plans (docs/training.md).",
+        ),
+    ] = None,
+    sampler_kind: Annotated[
+        str | None, typer.Option(help="Kind of that server: `vllm` or `sglang`. Default: `vllm`.")
+    ] = None,
+    sampler_key: Annotated[
+        str, typer.Option(envvar="EMBOMATRIX_SAMPLER_KEY", help="API key of that server.")
+    ] = "",
     warn_after: Annotated[
         float | None,
         typer.Option(min=0, metavar="MINUTES", help="Print a warning if the run takes longer. It goes on."),
@@ -132,6 +146,8 @@ def train(
             "imitation.steps": imitate_steps,
             "evaluation.every": evaluate_every,
             "track": track,
+            "sampler.url": sampler_url,
+            "sampler.kind": sampler_kind,
             **_coefficients(reward or ()),
         }
         if plan_memory is not None:
@@ -146,7 +162,8 @@ def train(
         start = _start(dataset, out, model, settings_file, changes, resume=resume)
         _show_limits(start)
         clock = clock_of(start, began_s=began_s, warn_after_s=None if warn_after is None else 60 * warn_after)
-        _show_summary(_run(start, connect, out, record, clock))
+        with start.model_server(out, key=sampler_key) as server:
+            _show_summary(_run(start, connect, out, record, clock, server))
 
 
 def imitate(
@@ -235,7 +252,12 @@ def _coefficients(options: Sequence[str]) -> dict[str, str]:
 
 
 def _run(
-    start: RunStart, connect: Connect, out: Path, record: Path | None, clock: RunClock
+    start: RunStart,
+    connect: Connect,
+    out: Path,
+    record: Path | None,
+    clock: RunClock,
+    server: ServerSampler | None,
 ) -> TrainingSummary:
     from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
     from embomatrix.trainer.cluster.gateway import Gateway
@@ -256,7 +278,7 @@ def _run(
         trackers_of(settings, out) as trackers,
         display_on(Console(), clock) as display,
     ):
-        return TrainingRun(start, gateway, display, out, trackers).run()
+        return TrainingRun(start, gateway, display, out, trackers, server).run()
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final, Self
+from urllib.parse import urlsplit
 
 from pydantic import (
     BaseModel,
@@ -103,6 +104,13 @@ class Overlong(StrEnum):
     MASK = "mask"  # leave its tokens out of the loss (DAPO's overlong filtering); its reward stays in the group's mean
 
 
+class ServerKind(StrEnum):
+    """Model server that samples plans."""
+
+    VLLM = "vllm"
+    SGLANG = "sglang"
+
+
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -125,6 +133,37 @@ class LoraSettings(_Frozen):
     """The adapters' output is scaled by alpha / rank."""
     targets: tuple[str, ...] = ()
     """Last parts of the names of the linear layers to adapt. Empty: all except the output layer."""
+
+
+def _is_http_address(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # a port above 65535, or half of an IPv6 address
+        return False
+
+
+class SamplerSettings(_Frozen):
+    """Model server that samples the plans of a Hugging Face model."""
+
+    url: str = ""
+    """Address, such as ``http://127.0.0.1:8000``. Empty: the trainer's process samples."""
+    kind: ServerKind = ServerKind.VLLM
+    folder: str = ""
+    """Folder for weights on their way to the server, which reads it by this path. Empty: ``sampler`` in the run's folder."""
+    timeout_s: float = Field(default=600.0, gt=0)
+    """Seconds that one request may take."""
+    retry_s: float = Field(default=300.0, ge=0)
+    """Seconds for which the run waits for a server that is away or fails, before it ends."""
+    tolerance: float = Field(default=0.25, gt=0)
+    """Largest mean difference in nats between the server's log-probabilities and the trainer's, in the check at the start."""
+
+    @field_validator("url")
+    @classmethod
+    def _check_url(cls, value: str) -> str:
+        if value and not _is_http_address(value):
+            raise ValueError("expected an address such as http://127.0.0.1:8000")
+        return value.rstrip("/").removesuffix("/v1")
 
 
 class PromptSettings(_Frozen):
@@ -230,10 +269,10 @@ class GrpoSettings(_Frozen):
     """Groups whose rewards are all equal. ``LANGUAGE_MODEL_DEFAULTS`` keep them. A ``reserve`` replaces them in any case."""
     overlap: Overlap = Overlap.STREAM
     truncate_ratio: float | None = Field(default=None, ge=1)
-    """Truncated importance sampling with ``Overlap.AHEAD``: largest weight of plans from older weights. None: off.
+    """Truncated importance sampling: largest weight of plans from older weights (``Overlap.AHEAD``) or from a model server.
 
     The ratio's denominator is then the policy at the beginning of the step, and the weight is the probability under it
-    over that under the sampling policy.
+    over that under the sampling policy. None: off, or ``SERVER_TRUNCATE_RATIO`` with a model server.
     """
     reserve: int = Field(default=0, ge=0)
     """Dynamic sampling: maximum tasks per step that replace zero-variance groups."""
@@ -254,17 +293,6 @@ class GrpoSettings(_Frozen):
             raise ValueError(
                 f"expected at most {tasks}, the value of grpo.tasks_per_step, because a minibatch has at least one task: "
                 "lower it, or raise grpo.tasks_per_step"
-            )
-        return value
-
-    @field_validator("truncate_ratio")
-    @classmethod
-    def _check_truncate_ratio(cls, value: float | None, info: ValidationInfo) -> float | None:
-        overlap = info.data.get("overlap", Overlap.AHEAD)
-        if value is not None and overlap is not Overlap.AHEAD:
-            raise ValueError(
-                f"expected grpo.overlap = 'ahead' with it, found {overlap.value!r}, with which the policy that learns has "
-                "sampled the plans: leave it out, or change grpo.overlap"
             )
         return value
 
@@ -338,6 +366,7 @@ class TrainSettings(_Frozen):
     compute_dtype: ComputeDtype = ComputeDtype.AUTO
     tiny: TinySettings = TinySettings()
     lora: LoraSettings = LoraSettings()
+    sampler: SamplerSettings = SamplerSettings()
     prompt: PromptSettings = PromptSettings()
     imitation: ImitationSettings = ImitationSettings()
     grpo: GrpoSettings = GrpoSettings()
@@ -356,6 +385,8 @@ class TrainSettings(_Frozen):
         return value
 
 
+SERVER_TRUNCATE_RATIO: Final = 2.0
+"""Default of ``grpo.truncate_ratio`` with a model server, whose arithmetic differs from the trainer's."""
 LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "prompt.rename_share": 0.0,
     "imitation.batch": 4,
@@ -403,9 +434,35 @@ def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSet
 def checked_settings(values: Mapping[str, Any]) -> TrainSettings:
     """Validate nested ``values``. Raises TrainerError that names the field."""
     try:
-        return TrainSettings.model_validate(values)
+        settings = TrainSettings.model_validate(values)
     except ValidationError as error:
         raise settings_error(error) from error
+    return _with_server(settings) if settings.sampler.url else _without_server(settings)
+
+
+def _with_server(settings: TrainSettings) -> TrainSettings:
+    """Return the settings with ``SERVER_TRUNCATE_RATIO`` unless another ratio is given. Raises TrainerError."""
+    if settings.processes > 1:
+        raise TrainerError(
+            f"setting 'processes': expected 1 with sampler.url, because the server samples all plans at once (found "
+            f"{settings.processes}): leave one of them out"
+        )
+    if settings.grpo.truncate_ratio is not None:
+        return settings
+    grpo = settings.grpo.model_copy(update={"truncate_ratio": SERVER_TRUNCATE_RATIO})
+    return settings.model_copy(update={"grpo": grpo})
+
+
+def _without_server(settings: TrainSettings) -> TrainSettings:
+    """Return the settings. Raises TrainerError for truncated importance sampling of plans that the policy itself sampled."""
+    grpo = settings.grpo
+    if grpo.truncate_ratio is not None and grpo.overlap is not Overlap.AHEAD:
+        raise TrainerError(
+            f"setting 'grpo.truncate_ratio': expected grpo.overlap = 'ahead' or sampler.url with it, found "
+            f"{grpo.overlap.value!r} and no server, with which the policy that learns has sampled the plans: leave it out, or "
+            f"change grpo.overlap (found {grpo.truncate_ratio:g})"
+        )
+    return settings
 
 
 def settings_error(error: ValidationError) -> TrainerError:

@@ -31,7 +31,8 @@ from embomatrix.trainer.evaluation.answers import Answer
 from embomatrix.trainer.evaluation.intervals import mean_over_tasks, paired_difference
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
 from embomatrix.trainer.learning.learner import Learner, SamplingRule
-from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
+from embomatrix.trainer.serving.sampler import Draw, ServerSampler, begin_drawing
 
 if TYPE_CHECKING:
     from embomatrix.trainer.config.settings import EvaluationSettings
@@ -107,8 +108,11 @@ def evaluate_policy(
     seed: int,
     label: str,
     report: Callable[[int, int], None],
+    server: ServerSampler | None = None,
 ) -> HeldOutEvaluation:
-    """Sample plans of each task and execute each once. ``report`` gets finished and total tasks.
+    """Sample plans of each task and execute each once. The workers sample, unless there is a model ``server``.
+
+    ``report`` gets finished and total tasks.
 
     A chunk of tasks has its own seed, so its plans are the same in whichever process they are sampled. Raises TrainerError if
     the cluster failed, or no worker took any plan.
@@ -120,9 +124,14 @@ def evaluate_policy(
     report(0, len(tasks))
     collected = _Collected(codec, lambda done: report(done, len(tasks)))
 
-    def sample(number: int, chunk: Sequence[TrainingTask], learner: Learner | RemoteLearner) -> None:
-        prompts = [prompt_builder.plain(task) for task in chunk]
-        drawn = learner.sample([prompt.tokens for prompt in prompts], _seed_of(seed, number), rule)
+    def sample(
+        number: int,
+        chunk: Sequence[TrainingTask],
+        prompts: Sequence[TaskPrompt],
+        draw: Draw,
+        learner: Learner | RemoteLearner,
+    ) -> None:
+        drawn = draw(learner)
         groups = [
             PlanGroup(
                 task,
@@ -137,7 +146,12 @@ def evaluate_policy(
         if learner is workers.local:  # on the thread of the caller
             collected.take_finished()
 
-    workers.map([(number, functools.partial(sample, number, chunk)) for number, chunk in enumerate(chunks)])
+    jobs = []
+    for number, chunk in enumerate(chunks):
+        prompts = [prompt_builder.plain(task) for task in chunk]
+        draw = begin_drawing(server, [prompt.tokens for prompt in prompts], _seed_of(seed, number), rule)
+        jobs.append((number, functools.partial(sample, number, chunk, prompts, draw)))
+    workers.map(jobs)
     collected.take_all()
     refuse_without_workers(collected.outcomes, f"the evaluation on {len(tasks)} tasks")
     return HeldOutEvaluation(tuple(collected.scores), tuple(collected.answers))

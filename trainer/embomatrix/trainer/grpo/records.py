@@ -21,7 +21,9 @@ class StepRecord:
     Rates are over rollouts with a result. Token means are over the plans that had a gradient, in all updates of the step,
     None if there were none. ``gradient_norm`` is the mean over the updates.
     ``reward_format``, ``reward_relevance`` and ``reward_goal`` are the means of the tiers and add up to ``reward``.
-    ``kl`` is to the reference policy, ``kl_to_old`` to the policy that sampled.
+    ``kl`` is to the reference policy, ``kl_to_old`` to the policy that sampled. ``sampler_gap`` and ``sampler_gap_max`` are
+    mean and maximum of the difference in nats between the log-probabilities of sampling and those of the policy at the
+    beginning of the step, 0 if the policy itself sampled.
     """
 
     step: int
@@ -39,6 +41,8 @@ class StepRecord:
     kl: float | None
     kl_to_old: float | None
     clipped: float | None
+    sampler_gap: float | None
+    sampler_gap_max: float | None
     gradient_norm: float
     learning_rate: float
     rollouts: int
@@ -96,6 +100,8 @@ def record_of(
         kl=over_tokens("kl_to_reference"),
         kl_to_old=over_tokens("kl_to_old"),
         clipped=over_tokens("clip_fraction"),
+        sampler_gap=over_tokens("sampler_gap"),
+        sampler_gap_max=max((part.sampler_gap_max for part in metrics), default=None),
         gradient_norm=_mean(norms),
         learning_rate=rate,
         rollouts=len(outcomes),

@@ -16,8 +16,10 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome, PlanSubmitter, result_of
 from embomatrix.trainer.config.settings import GrpoSettings, Overlong
 from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.learning.learner import SamplingRule
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
+from embomatrix.trainer.serving.sampler import Draw, ServerSampler, begin_drawing
 
 if TYPE_CHECKING:
     from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
@@ -32,7 +34,7 @@ class SampledChunk:
 
     ``mask`` (plans, tokens) is the samples' mask without the plans that ``Overlong.MASK`` leaves out. ``reference``:
     log-probabilities (plans, tokens) of the reference policy, None without a KL term. ``old_logprobs``: those of the policy
-    at the beginning of the step, None if they are not needed or the samples' own.
+    at the beginning of the step, None if they are not needed or the samples' own. A model server's samples need them.
     """
 
     index: int
@@ -64,7 +66,7 @@ class SampledChunk:
 
 
 class Sampler:
-    """Samples plans on all data-parallel workers while the cluster executes earlier ones."""
+    """Samples plans on all data-parallel workers, or on a model server, while the cluster executes earlier ones."""
 
     def __init__(
         self,
@@ -73,7 +75,9 @@ class Sampler:
         prompt_builder: PromptBuilder,
         gateway: PlanSubmitter,
         settings: GrpoSettings,
+        server: ServerSampler | None = None,
     ) -> None:
+        self._server = server
         self._workers = workers
         self._codec = codec
         self._prompt_builder = prompt_builder
@@ -92,15 +96,17 @@ class Sampler:
     ) -> list[SampledChunk]:
         """Sample the tasks in chunks. Each chunk is submitted before its process samples the next one.
 
-        A chunk's samples depend only on its index and ``generator``, not on the process that draws them. ``seed_of`` returns
-        the seed of a task's rollouts in a step.
+        A chunk's samples depend only on its index and ``generator``, not on the process that draws them. A model server
+        samples all chunks at once. ``seed_of`` returns the seed of a task's rollouts in a step.
         """
-        size = self._settings.chunk
+        settings = self._settings
+        size, rule = settings.chunk, SamplingRule(settings.group, settings.temperature, settings.max_new)
         jobs = []
         for index, at in enumerate(range(0, len(tasks), size), start=first_index):
             prompts = [(task, self._prompt_builder.varied(task, rng)) for task in tasks[at : at + size]]
             seed = int(torch.randint(_SEEDS, (), generator=generator, device=generator.device))
-            jobs.append((index, functools.partial(self._chunk, step, index, prompts, seed, seed_of)))
+            draw = begin_drawing(self._server, [prompt.tokens for _, prompt in prompts], seed, rule)
+            jobs.append((index, functools.partial(self._chunk, step, index, prompts, draw, seed_of)))
         chunks = self._workers.map(jobs)
         if not self._settings.kl_coef:
             return chunks
@@ -120,12 +126,12 @@ class Sampler:
         step: int,
         index: int,
         prompts: Sequence[tuple[TrainingTask, TaskPrompt]],
-        seed: int,
+        draw: Draw,
         seed_of: Callable[[int, str], int],
         learner: Learner | RemoteLearner,
     ) -> SampledChunk:
         group = self._settings.group
-        samples = learner.sample([prompt.tokens for _, prompt in prompts], seed)
+        samples = draw(learner)
         plans = [
             PlanGroup(
                 task,

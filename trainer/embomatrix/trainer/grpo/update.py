@@ -44,6 +44,7 @@ from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
+from embomatrix.trainer.serving.sampler import ServerSampler
 
 MAX_BAD_GRADIENTS = 5
 """Consecutive updates with a non-finite gradient before the run ends: it has diverged."""
@@ -85,13 +86,15 @@ class Updater:
         gateway: PlanSubmitter,
         settings: GrpoSettings,
         stopwatch: Stopwatch,
+        server: ServerSampler | None = None,
     ) -> None:
         self._policy = policy
         self._settings = settings
         self._stopwatch = stopwatch
         self._workers = workers
         self._gradient = GradientSum(policy, workers)
-        self._sampler = Sampler(workers, policy.codec, prompt_builder, gateway, settings)
+        self._is_served = server is not None
+        self._sampler = Sampler(workers, policy.codec, prompt_builder, gateway, settings, server)
         self._ahead: tuple[int, list[SampledChunk]] | None = None
         self._bad_gradients = 0
         self.is_between_updates = False
@@ -135,7 +138,7 @@ class Updater:
         """Return this step's chunks, sampled now or one step ago. With ``AHEAD``, also sample the next step's."""
         ready, self._ahead = self._ahead, None
         if ready is None or ready[0] != plan.step:
-            chunks = self._sample(plan, plan.step, plan.tasks)
+            chunks = self._sample_now(plan, plan.tasks)
         elif self._settings.truncate_ratio is not None:
             chunks = self._sampler.with_old_logprobs(ready[1])
         else:
@@ -143,6 +146,15 @@ class Updater:
         if self._settings.overlap is Overlap.AHEAD and plan.upcoming:
             coming = plan.step + 1
             self._ahead = coming, self._sample(plan, coming, plan.upcoming)
+        return chunks
+
+    def _sample_now(
+        self, plan: StepPlan, tasks: Sequence[TrainingTask], first_index: int = 0
+    ) -> list[SampledChunk]:
+        """Sample for this step. Log-probabilities of a model server differ from those of the policy, which are added."""
+        chunks = self._sample(plan, plan.step, tasks, first_index)
+        if self._is_served and self._settings.truncate_ratio is not None:
+            return self._sampler.with_old_logprobs(chunks)
         return chunks
 
     def _sample(
@@ -241,7 +253,7 @@ class Updater:
             tasks, reserve = reserve[:missing], reserve[missing:]
             replaced += len(tasks)
             with self._stopwatch.track(Activity.SAMPLING):
-                chunks = self._sample(plan, plan.step, tasks, next_index)
+                chunks = self._sample_now(plan, tasks, next_index)
             next_index += len(chunks)
             take(chunks, state)
 

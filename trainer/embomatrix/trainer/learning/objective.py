@@ -8,8 +8,9 @@ with one importance ratio rho per *plan*: ``LossKind.PAPER`` with ``RatioLevel.S
 groups, so microbatches can be back-propagated one by one as results arrive. ``LossTotals`` carries the denominators of
 the whole step, or of a minibatch.
 
-``GrpoSettings.truncate_ratio`` is truncated importance sampling, Yao et al. 2025: plans of an older policy mu are weighted
-with min(policy at the beginning of the step / mu, C), and the ratio compares the policy with that at the beginning.
+``GrpoSettings.truncate_ratio`` is truncated importance sampling, Yao et al. 2025: plans of another policy mu, an older one or
+that of a model server, are weighted with min(policy at the beginning of the step / mu, C), and the ratio compares the policy
+with that at the beginning.
 
 Sources of the other kinds: GRPO, Shao et al. 2024 (DeepSeekMath); DAPO, Yu et al. 2025; Dr. GRPO, Liu et al. 2025; GSPO,
 Zheng et al. 2025; BNPO as in TRL. All kinds equal TRL's losses in value and gradient (tests/peers/test_losses_of_trl.py).
@@ -82,12 +83,18 @@ class LossInputs:
 
 @dataclass(frozen=True, slots=True)
 class LossMetrics:
-    """Means over the tokens of a microbatch, for the log. ``weight`` is the number of tokens."""
+    """Means over the tokens of a microbatch, for the log. ``weight`` is the number of tokens.
+
+    ``sampler_gap`` is the mean and ``sampler_gap_max`` the maximum of the absolute difference in nats between the
+    log-probabilities with which plans were sampled and those in the ratio's denominator.
+    """
 
     clip_fraction: float
     kl_to_reference: float
     kl_to_old: float
     entropy: float
+    sampler_gap: float
+    sampler_gap_max: float
     weight: int
 
 
@@ -165,10 +172,13 @@ def _metrics(
 
     reference, entropy = inputs.reference, inputs.entropy
     sampler = inputs.old_logprobs if inputs.sampler_logprobs is None else inputs.sampler_logprobs
+    gap = (inputs.old_logprobs - sampler).abs() * mask  # (plans, tokens)
     return LossMetrics(
         clip_fraction=mean((low | high).to(mask.dtype).expand_as(mask)),
         kl_to_reference=0.0 if reference is None else mean(kl_estimate(inputs.logprobs, reference)),
         kl_to_old=mean(kl_estimate(inputs.logprobs, sampler)),
         entropy=0.0 if entropy is None else mean(entropy),
+        sampler_gap=mean(gap),
+        sampler_gap_max=float(gap.max()),
         weight=int(mask.sum()),
     )

@@ -21,7 +21,7 @@ from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.config.errors import TrainerError, reason_of
 from embomatrix.trainer.config.settings import ComputeDtype, LoraSettings, TrainSettings
 from embomatrix.trainer.policy.compute_dtype import frozen_weights, torch_dtype, use_compute_dtype
-from embomatrix.trainer.policy.lora import add_adapters, load_adapters, save_adapters
+from embomatrix.trainer.policy.lora import ADAPTERS, add_adapters, load_adapters, save_adapters
 from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left
 from embomatrix.trainer.policy.token_scores import chunked_scores, has_plain_head
 from embomatrix.world.json_text import parse_json
@@ -66,11 +66,11 @@ class HfPolicy:
         self.module = model.eval()
         self._has_plain_head = has_plain_head(model)
         self._gradient_checkpointing = gradient_checkpointing
-        self._has_adapters = False
+        self.has_adapters = False
         self._tokenizer = tokenizer
         self.context = _context_of(model)
-        self._end = _end_tokens(model, tokenizer)
-        self._pad = self._end[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
+        self.end_tokens = _end_tokens(model, tokenizer)
+        self._pad = self.end_tokens[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
 
     @classmethod
     def load(
@@ -122,7 +122,7 @@ class HfPolicy:
     def adapt(self, lora: LoraSettings, *, seed: int, saved: Path | None = None) -> None:
         """Freeze the model and train low-rank adapters, new ones or those in the folder ``saved``. Raises TrainerError."""
         self.module = add_adapters(self.module, lora, seed=seed)
-        self._has_adapters = True
+        self.has_adapters = True
         if saved is not None:
             load_adapters(self.module, saved)
 
@@ -153,7 +153,7 @@ class HfPolicy:
         return str(render([{**user, "content": f"{prompt.system}\n\n{prompt.user}"}]))
 
     def encode_plan(self, text: str) -> Tokens:
-        return (*self._tokens(text), self._end[0])
+        return (*self._tokens(text), self.end_tokens[0])
 
     def unknown_words(self, text: str) -> frozenset[str]:
         unknown = self._tokenizer.unk_token_id
@@ -178,7 +178,7 @@ class HfPolicy:
             scores = self._head(states)[:, -1].float().repeat_interleave(group, dim=0)  # (rows, V)
             rows = scores.shape[0]
             lengths = mask.sum(dim=1)  # (rows,)
-            end = torch.tensor(self._end, device=scores.device)
+            end = torch.tensor(self.end_tokens, device=scores.device)
             done = torch.zeros(rows, dtype=torch.bool, device=scores.device)
             tokens, masks, logprobs = [], [], []
             for at in range(max_new):
@@ -301,6 +301,24 @@ class HfPolicy:
             for row, own in zip(tokens, mask, strict=True)
         )
 
+    def samples_of(self, plans: Sequence[Tokens], logprobs: Sequence[Sequence[float]]) -> Samples:
+        """Return plans that a model server sampled, with their log-probabilities. Tokens after an end token are dropped."""
+        device, end = self.module.device, set(self.end_tokens)
+        lengths = [
+            next((at for at, token in enumerate(plan, 1) if token in end), len(plan)) for plan in plans
+        ]
+        shape = len(plans), max(lengths)
+        tokens = torch.full(shape, self._pad, device=device)
+        mask = torch.arange(shape[1], device=device) < torch.tensor(lengths, device=device)[:, None]
+        scores = torch.zeros(shape, device=device)
+        for row, (plan, own, length) in enumerate(zip(plans, logprobs, lengths, strict=True)):
+            tokens[row, :length] = torch.tensor(plan[:length], device=device)
+            scores[row, :length] = torch.tensor(own[:length], device=device)
+        cut_off = torch.tensor(
+            [plan[length - 1] not in end for plan, length in zip(plans, lengths, strict=True)], device=device
+        )
+        return Samples(tokens, mask, scores, self._texts(tokens, mask), cut_off)
+
     def frozen_copy(self) -> HfPolicy:
         """Return a frozen copy that shares all frozen parameters: with adapters, the whole base model."""
         twin = copy.copy(self)
@@ -319,14 +337,25 @@ class HfPolicy:
         setattr(self.module.config, CODEC_KEY, self.codec.value)
         try:
             model = self.module
-            if self._has_adapters:
+            if self.has_adapters:
                 model = copy.deepcopy(model).merge_and_unload()
             model.save_pretrained(folder)
         except SafetensorError as error:
             raise OSError(str(error)) from error
         self._tokenizer.save_pretrained(folder)
-        if self._has_adapters:
+        if self.has_adapters:
             save_adapters(self.module, folder)
+
+    def save_for_server(self, folder: Path) -> Path:
+        """Save the adapters, or the whole model if it has none. Return the folder that a model server loads.
+
+        Raises OSError.
+        """
+        if not self.has_adapters:
+            self.save(folder)
+            return folder
+        save_adapters(self.module, folder)
+        return folder / ADAPTERS
 
     @staticmethod
     def is_saved_in(folder: Path) -> bool:

@@ -58,9 +58,10 @@ def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
 
 def check_word_level(settings: TrainSettings) -> None:
     """Raise TrainerError if settings of Hugging Face models are given for the word-level policy."""
-    if settings.lora.rank or settings.gradient_checkpointing:
+    if settings.lora.rank or settings.gradient_checkpointing or settings.sampler.url:
         raise TrainerError(
-            "lora and gradient_checkpointing are for Hugging Face models, not for the word-level policy: leave them out"
+            "lora, gradient_checkpointing and sampler.url are for Hugging Face models, not for the word-level policy: leave "
+            "them out"
         )
 
 

@@ -33,6 +33,7 @@ from embomatrix.trainer.logging.trackers import Tracker
 from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.run.imitation import run_imitation
 from embomatrix.trainer.run.starting import REFERENCE, RunStart
+from embomatrix.trainer.serving.sampler import ServerSampler
 
 if TYPE_CHECKING:
     from embomatrix.trainer.logging.display import LineDisplay
@@ -42,7 +43,7 @@ RESERVE_STREAM = 1
 
 
 class TrainingRun:
-    """One run in the folder ``out``."""
+    """One run in the folder ``out``. ``server`` samples its plans if one is given; it holds the policy's present weights."""
 
     def __init__(
         self,
@@ -51,8 +52,10 @@ class TrainingRun:
         display: LineDisplay,
         out: Path,
         trackers: Sequence[Tracker] = (),
+        server: ServerSampler | None = None,
     ) -> None:
         self._start = start
+        self._server = server
         self._gateway = gateway
         self._display = display
         self._settings = start.settings
@@ -86,7 +89,13 @@ class TrainingRun:
         """Run GRPO on all data-parallel workers. Return the last checkpoint."""
         start, settings = self._start, self._settings
         updater = Updater(
-            start.policy, workers, start.prompt_builder, self._gateway, settings.grpo, self._stopwatch
+            start.policy,
+            workers,
+            start.prompt_builder,
+            self._gateway,
+            settings.grpo,
+            self._stopwatch,
+            self._server,
         )
         newest = self._store.latest() if self._resumed else None
         if newest is not None:
@@ -110,6 +119,7 @@ class TrainingRun:
         policy, progress = self._start.policy, self._progress
         with self._stopwatch.track(Activity.IMITATION):
             run_imitation(self._start, workers, self._out, self._recorder, self._display.imitation)
+        self._publish()
         before = self._evaluate(BEFORE, self._settings.evaluation.samples, workers)
         progress.before = before.as_json() if before else []
         with atomic_folder(self._out / REFERENCE) as folder:
@@ -133,6 +143,7 @@ class TrainingRun:
                 seed=settings.seed,
                 label=f"{label.replace(' ', '-')}-{step}",
                 report=lambda done, total: self._display.evaluating(label, done, total),
+                server=self._server,
             )
         self._display.evaluated(label, result)
         self._recorder.evaluation(step, label, result)
@@ -165,8 +176,15 @@ class TrainingRun:
                 progress.cursor, progress.reserve_cursor = schedule.cursor, reserve.cursor
                 progress.grpo_s += seconds
                 self._record(record, logs, seconds)
+            self._publish()
             if progress.step % self._settings.checkpoint_every == 0:
                 self._save(updater)
+
+    def _publish(self) -> None:
+        """Give the new weights to the model server, if one samples."""
+        if self._server is not None:
+            with self._stopwatch.track(Activity.SAMPLING):
+                self._server.publish()
 
     @contextlib.contextmanager
     def _rollback_on_error(self) -> Iterator[None]:

@@ -1,7 +1,8 @@
 """Start of a run: settings, tasks and policy, new or from a checkpoint."""
 
+import contextlib
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -28,10 +29,18 @@ from embomatrix.trainer.logging.outcome import OUTCOME
 from embomatrix.trainer.logging.recorder import IMITATION, METRICS, SAMPLES
 from embomatrix.trainer.logging.report import REPORT
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.limits import Limits, Ruler, expressibility, sentence_about, with_limits
+from embomatrix.trainer.policy.limits import (
+    Limits,
+    Ruler,
+    expressibility,
+    prompts_of,
+    sentence_about,
+    with_limits,
+)
 from embomatrix.trainer.policy.loading import TINY, configure_torch, is_word_level, new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
+from embomatrix.trainer.serving.sampler import ServerSampler, open_sampler
 
 LOG_MARK: Final = b'{"step"'
 """First bytes of each log of a run."""
@@ -42,9 +51,19 @@ CHANGEABLE: Final = frozenset(
         *("device", "threads", "processes", "track", "checkpoint_every", "keep_checkpoints", "samples_every"),
         *("grpo.minutes", "grpo.steps", "imitation.seconds", "imitation.steps", "imitation.chunk"),
         *("evaluation.every", "evaluation.samples_during"),
+        *(
+            "sampler.url",
+            "sampler.kind",
+            "sampler.folder",
+            "sampler.timeout_s",
+            "sampler.retry_s",
+            "sampler.tolerance",
+        ),
     }
 )
 """Settings that may change on resume: budget, hardware, memory use and logging."""
+SERVED: Final = "sampler.url"
+"""Setting that moves a run to another server on resume, but neither to a first server nor back to the trainer's process."""
 AFTER_IMITATION: Final = ("grpo.", "reward.", "evaluation.")
 """Prefixes of settings that may also change until imitation is finished."""
 
@@ -68,6 +87,19 @@ class RunStart:
         prompt = self.settings.prompt
         variation = Variation(self.tasks.kinds, prompt.rename_share, prompt.drop_share)
         return PromptBuilder(self.policy, prompt.rows, variation, prompt.practice_rename_share)
+
+    @contextlib.contextmanager
+    def model_server(self, out: Path, *, key: str = "") -> Iterator[ServerSampler | None]:
+        """Connect to the model server of the settings and check it, None without one. Raises TrainerError."""
+        if not self.settings.sampler.url or not isinstance(self.policy, HfPolicy):
+            yield None
+            return
+        prompts = prompts_of(
+            (*self.tasks.train, *self.tasks.heldout), self.settings.prompt.rows, self.policy.codec
+        )
+        longest = max((self.policy.encode(prompt) for prompt in prompts.values()), key=len)
+        with open_sampler(self.policy, self.settings, longest, out, key=key) as sampler:
+            yield sampler
 
     @property
     def about_limits(self) -> tuple[str, ...]:
@@ -185,7 +217,8 @@ def _check_unchanged(out: Path, original: TrainSettings, now: TrainSettings, *, 
     """Raise TrainerError for the first differing setting that would change what is learned."""
     before, after = _flat(original.model_dump()), _flat(now.model_dump())
     for key, value in after.items():
-        changeable = key in CHANGEABLE or (not grpo_ready and key.startswith(AFTER_IMITATION))
+        moves = key != SERVED or bool(value) == bool(before[key]) or not grpo_ready
+        changeable = (key in CHANGEABLE and moves) or (not grpo_ready and key.startswith(AFTER_IMITATION))
         if value != before[key] and not changeable:
             raise TrainerError(
                 f"the run in {out} was started with {key} = {before[key]!r}, and can't be resumed with {value!r}: leave "
