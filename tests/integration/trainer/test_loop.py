@@ -110,6 +110,15 @@ def test_evaluations_during_training_change_nothing_and_a_resumed_run_repeats_no
     assert read_evaluations(tmp_path / "halves") == found
 
 
+def test_evaluations_on_some_tasks_use_the_same_ones_each_time(tmp_path):
+    summary, _ = run(tmp_path, evaluation__tasks=2, evaluation__every=1, grpo__steps=2, imitation__steps=1)
+    asked = [{answer.verdict.task_id for answer in each.answers} for each in read_evaluations(tmp_path)]
+    assert len(asked) == 3
+    assert asked[0] == asked[1] == asked[2]
+    assert asked[0] < {task.task.task_id for task in TASKS.heldout}
+    assert success_rows(summary)[0][:2] == ("all", "2")
+
+
 def test_cut_lines_of_an_evaluation_are_left_out(tmp_path):
     run(tmp_path)
     path = tmp_path / EVALUATIONS

@@ -87,6 +87,10 @@ def train(
         int | None,
         typer.Option(min=0, help="Steps of GRPO between evaluations on held-out tasks. Default: 0, none."),
     ] = None,
+    evaluate_tasks: Annotated[
+        int | None,
+        typer.Option(min=1, help="Held-out tasks of each evaluation, drawn by the seed. Default: all."),
+    ] = None,
     resume: _RESUME = False,
     seed: _SEED = None,
     settings_file: _SETTINGS = None,
@@ -145,6 +149,7 @@ def train(
             "imitation.seconds": imitate_seconds,
             "imitation.steps": imitate_steps,
             "evaluation.every": evaluate_every,
+            "evaluation.tasks": evaluate_tasks,
             "track": track,
             "sampler.url": sampler_url,
             "sampler.kind": sampler_kind,

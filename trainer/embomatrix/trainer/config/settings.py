@@ -329,6 +329,8 @@ class RewardTable(_Frozen):
 class EvaluationSettings(_Frozen):
     """Evaluation on held-out tasks."""
 
+    tasks: int | None = Field(default=None, ge=1)
+    """Held-out tasks that all evaluations of a run use, drawn by its seed. None: all."""
     samples: int = Field(default=10, ge=1)
     """Plans per task before and after GRPO."""
     every: int = Field(default=0, ge=0)

@@ -129,13 +129,14 @@ class TrainingRun:
 
     def _evaluate(self, label: str, samples: int, workers: DataParallelWorkers) -> HeldOutEvaluation | None:
         start, settings, step = self._start, self._settings, self._progress.step
-        if not start.tasks.heldout:
+        tasks = start.evaluated
+        if not tasks:
             return None
         with self._stopwatch.track(Activity.EVALUATION):
             result = evaluate_policy(
                 workers,
                 start.prompt_builder,
-                start.tasks.heldout,
+                tasks,
                 self._gateway,
                 settings.evaluation,
                 samples=samples,

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from embomatrix.host.limits import usable_cores
 from embomatrix.host.own_files import is_own
 from embomatrix.trainer.config.errors import TrainerError
@@ -16,7 +18,7 @@ from embomatrix.trainer.config.settings import (
     read_settings,
     with_changes,
 )
-from embomatrix.trainer.data.tasks import TaskSet, load_tasks
+from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.lifecycle.checkpoint import (
     CHECKPOINTS,
@@ -100,6 +102,17 @@ class RunStart:
         longest = max((self.policy.encode(prompt) for prompt in prompts.values()), key=len)
         with open_sampler(self.policy, self.settings, longest, out, key=key) as sampler:
             yield sampler
+
+    @property
+    def evaluated(self) -> tuple[TrainingTask, ...]:
+        """Held-out tasks of the run's evaluations, in the order of the dataset."""
+        heldout, number = self.tasks.heldout, self.settings.evaluation.tasks
+        if number is None:
+            return tuple(heldout)
+        order = np.random.default_rng(np.random.SeedSequence((self.settings.seed, 5))).permutation(
+            len(heldout)
+        )
+        return tuple(heldout[int(at)] for at in sorted(order[:number]))
 
     @property
     def about_limits(self) -> tuple[str, ...]:

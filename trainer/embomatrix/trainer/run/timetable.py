@@ -29,7 +29,7 @@ def clock_of(start: RunStart, *, began_s: float, warn_after_s: float | None = No
     during = evaluations_during(settings.evaluation, grpo.steps or 0, begun_at=progress.step)
     by_label = {BEFORE: samples, AFTER: samples, DURING: settings.evaluation.samples_during if during else 0}
     counts = {BEFORE: 0 if progress.grpo_ready else 1, DURING: during, AFTER: 1}
-    total = len(start.tasks.heldout) * sum(counts[label] * each for label, each in by_label.items())
+    total = len(start.evaluated) * sum(counts[label] * each for label, each in by_label.items())
     grpo_phase = PhaseTime(
         typical_s=GRPO_STEP_S * grpo.steps if typical and grpo.steps else None,
         budget_s=60 * grpo.minutes if grpo.steps is None else None,
