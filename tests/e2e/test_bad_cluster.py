@@ -199,9 +199,15 @@ def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
         newest = max((tmp_path / "late" / "checkpoints").iterdir())
         assert newest.name.startswith("step-")
         full = run_anew(
-            *common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", largest_file=64 * 1024
+            *common,
+            f"--out={tmp_path / 'full'}",
+            "--imitate-seconds=0.5",
+            "--processes=1",
+            largest_file=64 * 1024,
         )
         assert_ended(full, 2, "can't be written", "free space or fix the")
+        shared = run_anew(*common, f"--out={tmp_path / 'shared'}", largest_file=64 * 1024)
+        assert_ended(shared, 2, "can't be put into shared memory", "set processes to 1")
         assert not list((tmp_path / "full").glob("reference*"))
 
 

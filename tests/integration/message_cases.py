@@ -355,12 +355,6 @@ COMMANDS = (
         "expected a text file",
     ),
     CommandCase(
-        "plan file that is no text",
-        "play apple_to_counter --dataset=KITCHEN --plan=FILES/binary.bddl",
-        "FILES/binary.bddl",
-        "expected a text file with JSON or one call a line",
-    ),
-    CommandCase(
         "file in place of a dataset",
         "play apple_to_counter --oracle --dataset=FILES/report.json",
         "FILES/report.json is a file",
@@ -375,7 +369,7 @@ COMMANDS = (
     CommandCase(
         "file that is no scene",
         "scene draw FILES/mesh.obj --out=FILES/new",
-        "FILES/mesh.obj is no scene",
+        "FILES/mesh.obj is no floor plan",
         "expected the name of a base scene, or a file that ends in",
     ),
     CommandCase(

@@ -74,6 +74,8 @@ ELSEWHERE = {
     r"--all|--physical": "takes minutes",
     r"my_assets|scenes/Rs_int.json --out": "needs the package coacd: tests/integration/factory imports without it",
     r"--interactive": "is played by a person: tests/integration/factory/test_trial.py",
+    r"vllm serve|sglang\.launch_server": "is a server that needs a GPU",
+    r"plan\.txt": "reads a plan of a person's own: tests/integration/cli/test_play.py",
     r"merge .* --resolve|--activity cook_bacon|merge mine talks imported": "is one of several forms of a command",
 }
 """Lines that aren't run here, and the reason."""
@@ -93,7 +95,7 @@ def shell_lines() -> list[ShellLine]:
     for page in PAGES:
         for language, block in FENCE.findall(page.read_text(encoding="utf-8")):
             if not language and not block.startswith(NOT_COMMANDS):
-                for line in block.replace("\\\n", " ").splitlines():
+                for line in filter(None, block.replace("\\\n", " ").splitlines()):
                     text, _, comment = line.partition("  #")
                     found.append(ShellLine(page.name, text.strip(), comment.strip()))
     return found

@@ -105,5 +105,5 @@ def test_missing_file_is_named(tmp_path: Path, name: str) -> None:
 def test_build_accepts_only_names(path: Path) -> None:
     result = CliRunner().invoke(app, ["build", str(path), "--out", str(path.parent / "out")])
     assert result.exit_code == 2
-    assert "unknown scene" in result.output
+    assert "is no floor plan: expected the name of a base scene" in result.output
     assert not (path.parent / "out").exists()

@@ -6,9 +6,31 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.fakes.small_llama import random_llama, word_tokenizer
+from tests.fakes.symbolic_household import make_tasks
 from tests.unit.trainer.conftest import one_thread, small_files  # noqa: F401
 
+from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.import_gguf import import_gguf
+
+SMALL_TASKS = make_tasks(6, 2, objects=8)
+"""Few tasks with few objects, for language models."""
+
+
+@pytest.fixture(scope="module")
+def tokenizer():
+    """Tokenizer of the words in ``SMALL_TASKS``."""
+    pytest.importorskip("tokenizers")
+    return word_tokenizer(SMALL_TASKS.train)
+
+
+@pytest.fixture(scope="module")
+def model_folder(tokenizer, tmp_path_factory):
+    """Folder of a random Llama with this tokenizer."""
+    folder = tmp_path_factory.mktemp("model")
+    HfPolicy(random_llama(tokenizer), tokenizer, Codec.LINES, "random llama").save(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,9 @@ import sys
 import pytest
 import torch
 from rich.console import Console
-from tests.fakes.small_llama import random_llama, word_tokenizer
-from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+from tests.fakes.small_llama import random_llama
+from tests.fakes.symbolic_household import SymbolicCluster
+from tests.integration.trainer.conftest import SMALL_TASKS
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.cluster.gateway import Gateway
@@ -31,13 +32,7 @@ from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.run.loop import TrainingRun
 from embomatrix.trainer.run.starting import RunStart, default_threads
 
-TASKS = make_tasks(6, 2, objects=8)
-
-
-@pytest.fixture(scope="module")
-def tokenizer():
-    pytest.importorskip("tokenizers")
-    return word_tokenizer(TASKS.train)
+TASKS = SMALL_TASKS
 
 
 @pytest.fixture

@@ -5,8 +5,9 @@ import shutil
 import pytest
 import torch
 from rich.console import Console
-from tests.fakes.small_llama import random_llama, word_tokenizer
-from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+from tests.fakes.small_llama import random_llama
+from tests.fakes.symbolic_household import SymbolicCluster
+from tests.integration.trainer.conftest import SMALL_TASKS
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.cluster.gateway import Gateway
@@ -27,7 +28,7 @@ from embomatrix.trainer.policy.lora import ADAPTERS
 from embomatrix.trainer.run.loop import TrainingRun
 from embomatrix.trainer.run.starting import REFERENCE, RunStart
 
-TASKS = make_tasks(6, 2, objects=8)
+TASKS = SMALL_TASKS
 SHAPE = LoraSettings(rank=4, alpha=8.0)
 SHORT = {
     "compute_dtype": "float32",
@@ -44,19 +45,6 @@ SHORT = {
     "checkpoint_every": 2,
     "keep_checkpoints": 9,
 }
-
-
-@pytest.fixture(scope="module")
-def tokenizer():
-    pytest.importorskip("tokenizers")
-    return word_tokenizer(TASKS.train)
-
-
-@pytest.fixture(scope="module")
-def model_folder(tokenizer, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("model")
-    HfPolicy(random_llama(tokenizer), tokenizer, Codec.LINES, "random llama").save(folder)
-    return folder
 
 
 def policy_of(tokenizer, *, seed=0, recompute=False):

@@ -9,8 +9,9 @@ import pytest
 import torch
 from rich.console import Console
 from tests.fakes.model_server import SGLANG, VLLM, ServedLlama
-from tests.fakes.small_llama import random_llama, word_tokenizer
-from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+from tests.fakes.small_llama import random_llama
+from tests.fakes.symbolic_household import SymbolicCluster
+from tests.integration.trainer.conftest import SMALL_TASKS
 
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.gateway import Gateway
@@ -25,7 +26,7 @@ from embomatrix.trainer.policy.loading import new_policy, saved_policy
 from embomatrix.trainer.run.loop import TrainingRun
 from embomatrix.trainer.run.starting import REFERENCE, RunStart
 
-TASKS = make_tasks(6, 2, objects=8)
+TASKS = SMALL_TASKS
 ADAPTERS = {"lora.rank": 4, "lora.alpha": 8.0}
 SHORT = {
     "compute_dtype": "float32",
@@ -52,19 +53,6 @@ EXACT = 1e-4
 """Nats by which two computations of one small model in float32 may differ."""
 PROBE = 2
 """Plans of the check at the start."""
-
-
-@pytest.fixture(scope="module")
-def tokenizer():
-    pytest.importorskip("tokenizers")
-    return word_tokenizer(TASKS.train)
-
-
-@pytest.fixture(scope="module")
-def model_folder(tokenizer, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("model")
-    HfPolicy(random_llama(tokenizer), tokenizer, Codec.LINES, "random llama").save(folder)
-    return folder
 
 
 def started(folder, url, changes):

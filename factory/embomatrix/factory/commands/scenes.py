@@ -353,7 +353,7 @@ def _houses(names: Sequence[str]) -> dict[str, Path | None]:
         path = Path(name) if name.endswith(HOUSE_SUFFIX) else None
         if path is None and Path(name).is_file():
             raise HouseFileError(
-                f"{name} is no scene: expected the name of a base scene, or a file that ends in {SUFFIX} or {HOUSE_SUFFIX}"
+                f"{name} is no floor plan: expected the name of a base scene, or a file that ends in {HOUSE_SUFFIX}"
             )
         scene_id = Catalog.load().inventory(name).scene_id if path is None else read_house(path).scene
         if scene_id in found:

@@ -25,11 +25,12 @@ import torch
 from torch import Tensor
 
 from embomatrix.host.anonymous_memory import nameless_file
-from embomatrix.trainer.config.errors import DAMAGE, TrainerError
+from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingRule
 from embomatrix.trainer.learning.likelihood import Example
 from embomatrix.trainer.learning.objective import LossMetrics
+from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
 from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
@@ -217,21 +218,27 @@ class DataParallelWorkers:
     @classmethod
     @contextlib.contextmanager
     def start(cls, policy: Policy, settings: TrainSettings) -> Iterator[Self]:
-        """Start ``settings.processes - 1`` remote learners, on the CPU, and end them with the block."""
+        """Start ``settings.processes - 1`` remote learners, on the CPU, and end them with the block. Raises TrainerError."""
         local = Learner(policy, None, settings.grpo)
         if settings.processes == 1:
             yield cls(local)
             return
         learning = list(policy.parameters())
-        weights = SharedTensors([parameter.data for parameter in learning])
+        try:
+            weights = SharedTensors([parameter.data for parameter in learning])
+        except OSError as error:
+            raise TrainerError(
+                f"the weights can't be put into shared memory ({reason_of(error)}): free memory, or set processes to 1"
+            ) from error
         for parameter, shared in zip(learning, weights.tensors, strict=True):
             shared.copy_(parameter.data)
             parameter.data = shared
         with tempfile.TemporaryDirectory(prefix="embomatrix-policy-") as name:
-            folder = Path(name)
-            policy.save(folder)
+            with atomic_folder(Path(name) / "policy") as folder:
+                policy.save(folder)
             remotes = [
-                RemoteLearner(number, settings, folder, weights) for number in range(1, settings.processes)
+                RemoteLearner(number, settings, Path(name) / "policy", weights)
+                for number in range(1, settings.processes)
             ]
             weights.close()
             try:

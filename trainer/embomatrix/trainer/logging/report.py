@@ -188,7 +188,7 @@ def _held_out_curve(evaluations: Sequence[RecordedEvaluation], tasks: TaskSet) -
     points = [(each.step, each.board(categories).success().interval) for each in evaluations if each.answers]
     return (
         "<section class='curve'><h2>Held-out success during GRPO</h2>"
-        f"<div class='chart'>{success_curve(points)}</div></section>"
+        f"<div class='scroll'>{success_curve(points)}</div></section>"
         if len(points) > 2
         else ""
     )
@@ -242,7 +242,7 @@ def _drawn(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _section_of_curve(curve: str) -> str:
-    return f'<section class="half"><div class="chart">{curve}</div></section>'
+    return f'<section class="half"><div class="scroll">{curve}</div></section>'
 
 
 def _times(outcome: RunOutcome) -> str:
