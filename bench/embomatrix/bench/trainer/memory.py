@@ -31,7 +31,7 @@ class _LongPlanLearner(Learner):
     longest_prompt = 0
     longest_plan = 0
 
-    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule | None = None) -> Samples:
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
         drawn = super().sample(prompts, seed, rule)
         self.longest_prompt = max(self.longest_prompt, *map(len, prompts))
         self.longest_plan = max(self.longest_plan, drawn.tokens.shape[1])

@@ -100,7 +100,7 @@ class Sampler:
         samples all chunks at once. ``seed_of`` returns the seed of a task's rollouts in a step.
         """
         settings = self._settings
-        size, rule = settings.chunk, SamplingRule(settings.group, settings.temperature, settings.max_new)
+        size, rule = settings.chunk, SamplingRule.of(settings)
         jobs = []
         for index, at in enumerate(range(0, len(tasks), size), start=first_index):
             prompts = [(task, self._prompt_builder.varied(task, rng)) for task in tasks[at : at + size]]

@@ -91,7 +91,7 @@ class RemoteLearner:
         """Load the reference policy, which GRPO needs."""
         self._request("use_reference", folder)
 
-    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule | None = None) -> Samples:
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
         samples: Samples = self._request("sample", tuple(prompts), seed, rule)
         return samples
 

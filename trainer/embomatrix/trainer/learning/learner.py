@@ -1,5 +1,7 @@
 """Work that any process with a copy of the policy can do: sample plans, score them, back-propagate a microbatch."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,6 +40,11 @@ class SamplingRule:
     temperature: float
     max_new: int
 
+    @staticmethod
+    def of(settings: GrpoSettings) -> SamplingRule:
+        """Return the rule by which GRPO samples."""
+        return SamplingRule(settings.group, settings.temperature, settings.max_new)
+
 
 class Learner:
     """A policy in this process, and its reference policy, which GRPO needs and imitation doesn't."""
@@ -47,10 +54,8 @@ class Learner:
         self.reference = reference
         self._settings = settings
 
-    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule | None = None) -> Samples:
-        """Draw plans for each prompt with a generator of this seed, by GRPO's settings unless a rule is given."""
-        settings = self._settings
-        rule = rule or SamplingRule(settings.group, settings.temperature, settings.max_new)
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
+        """Draw plans for each prompt with a generator of this seed."""
         device = next(iter(self.policy.parameters())).device
         generator = torch.Generator(device).manual_seed(seed)
         return self.policy.sample(prompts, rule.group, rule.temperature, rule.max_new, generator)
