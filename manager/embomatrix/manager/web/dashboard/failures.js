@@ -2,6 +2,7 @@
 import {ask} from "./ask.js";
 import {at, clock, count, counted, h, none, put, table} from "./dom.js";
 import {named, worded} from "./names.js";
+import {alike} from "./parts.js";
 
 const BAD = ["failed", "worker_lost", "scene_failed"];
 const KEPT = 200;
@@ -49,24 +50,12 @@ async function look(runs) {
 
 /** Merge failures of one reason, worker and message into the latest of them. */
 function merged(notes) {
-  const rows = new Map();
-  for (const note of notes) {
-    const said = JSON.stringify([note.code, note.worker_id, note.message]);
-    if (rows.has(said)) rows.get(said).count += note.count;
-    else rows.set(said, {...note});
-  }
-  return [...rows.values()];
+  return alike(notes, note => [note.code, note.worker_id, note.message]).map(group => ({...group[0], count: group.reduce((sum, note) => sum + note.count, 0)}));
 }
 
 /** Merge repeated events into one row. */
 function fold(events) {
-  const rows = new Map();
-  for (const event of events) {
-    const said = JSON.stringify([event.code || event.kind, event.worker_id, event.bundle_digest, event.attempt, event.message]);
-    if (rows.has(said)) rows.get(said).times += 1;
-    else rows.set(said, {event, times: 1});
-  }
-  return [...rows.values()];
+  return alike(events, event => [event.code || event.kind, event.worker_id, event.bundle_digest, event.attempt, event.message]).map(group => ({event: group[0], times: group.length}));
 }
 
 /** Table of numbers of rollouts and attempts by name, from pairs of a name and a number. */

@@ -22,6 +22,17 @@ export function phaseTable(durations) {
   return table(["phase", "", ["share", "n"], ["median", "n"], ["95 %", "n"], ["99 %", "n"]], rows, "latency by phase");
 }
 
+/** Groups of items with an equal cause, in the order of their first items. `causeOf` returns a list of values. */
+export function alike(items, causeOf) {
+  const groups = new Map();
+  for (const item of items) {
+    const cause = JSON.stringify(causeOf(item));
+    if (groups.has(cause)) groups.get(cause).push(item);
+    else groups.set(cause, [item]);
+  }
+  return [...groups.values()];
+}
+
 /** Failed leases and rollouts of a run, the latest first, with their number by reason. */
 export function failureParts(events, redispatched) {
   const again = `${counted(redispatched, "rollout")} ${redispatched === 1 ? "was" : "were"} leased again because ${redispatched === 1 ? "its" : "their"} worker left, drained or fell silent before it had a result.`;
@@ -29,16 +40,12 @@ export function failureParts(events, redispatched) {
   const reasons = {};
   for (const {code} of events) reasons[code] = (reasons[code] ?? 0) + 1;
   const counts = Object.entries(reasons).sort((a, b) => b[1] - a[1]).map(([code, n]) => `${code} (${count(n)})`).join(", ");
-  const alike = new Map();
-  for (const event of [...events].reverse()) {
-    const cause = JSON.stringify([event.kind, event.code, event.worker_id, event.bundle_digest, event.message]);
-    alike.set(cause, [...alike.get(cause) ?? [], event]);
-  }
-  const rows = [...alike.values()].slice(0, MESSAGES).map(([event, ...others]) => h("tr", {}, h("td", {class: "muted fit"}, stamp(event.at_s)), h("td", {class: "fit"}, event.kind === "failed" ? "attempt" : "rollout"),
+  const causes = alike([...events].reverse(), event => [event.kind, event.code, event.worker_id, event.bundle_digest, event.message]);
+  const rows = causes.slice(0, MESSAGES).map(([event, ...others]) => h("tr", {}, h("td", {class: "muted fit"}, stamp(event.at_s)), h("td", {class: "fit"}, event.kind === "failed" ? "attempt" : "rollout"),
     h("td", {class: "fit"}, h("code", {class: "bad"}, event.code)), h("td", {class: "named"}, event.worker_id ?? ""), h("td", {class: "named"}, event.rollout_id ?? "", others.length ? h("span", {class: "muted"}, ` and ${count(others.length)} more`) : ""),
     h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "message"}, worded(event.message ?? ""))));
   return [h("p", {}, `Latest: ${latestFailures(events)}, with the reasons ${counts}.`), table(["latest", "failed", "reason", "worker", "rollout", "scene", "message"], rows, "failures", "loose"),
-    alike.size > MESSAGES ? none(`The table shows the last ${MESSAGES} causes.`) : ""];
+    causes.length > MESSAGES ? none(`The table shows the last ${MESSAGES} causes.`) : ""];
 }
 
 /** Numbers of failed attempts and failed rollouts in a list of events. */
