@@ -145,13 +145,6 @@ def test_typed_plan_may_name_objects_and_shows_the_lines_that_are_no_calls(run):
     assert (wrong.exit_code, "did you mean apple_1" in " ".join(wrong.output.split())) == (1, True)
 
 
-def test_picture_as_a_plan_is_refused(run, tmp_path):
-    picture = tmp_path / "plan.png"
-    Image.new("RGB", (2, 2)).save(picture)
-    result = run("apple_to_counter", "--plan", str(picture))
-    assert (result.exit_code, "is not text: expected" in " ".join(result.output.split())) == (2, True)
-
-
 def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
     result = run("apple_to_counter", "--show")
     assert result.exit_code == 0
