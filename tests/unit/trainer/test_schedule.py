@@ -1,12 +1,14 @@
 """Task schedule: known arbitrarily far ahead, with and without a curriculum."""
 
+import dataclasses
 from collections import Counter
+from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes.symbolic_household import make_tasks
 
-from embomatrix.trainer.data.tasks import Curriculum, Schedule
+from embomatrix.trainer.data.tasks import SCENES_AT_ONCE, Curriculum, Schedule
 
 TASKS = make_tasks(12, 0, objects=10).train
 SIX = make_tasks(6, 2).train
@@ -61,3 +63,22 @@ def test_schedule_continues_from_its_cursor():
     whole = Schedule(SIX, seed=3)
     whole.take(4)
     assert Schedule(SIX, seed=3, cursor=4).take(9) == whole.take(9)
+
+
+def test_tasks_of_few_scenes_are_shuffled_together():
+    scenes = 3 * SCENES_AT_ONCE
+    tasks = [
+        dataclasses.replace(task, bundle_digest=f"{number % scenes}")
+        for number, task in enumerate(make_tasks(2 * scenes, 0, objects=10).train)
+    ]
+    schedule = Schedule(tasks, seed=5)
+    for _ in range(2):
+        taken = schedule.take(len(tasks))
+        assert Counter(ids(taken)) == Counter(ids(tasks))
+        windows = [
+            {task.bundle_digest for task in taken[begin : begin + 2 * SCENES_AT_ONCE]}
+            for begin in range(0, len(tasks), 2 * SCENES_AT_ONCE)
+        ]
+        assert [len(window) for window in windows] == [SCENES_AT_ONCE] * 3
+        neighbours = [first.bundle_digest == second.bundle_digest for first, second in pairwise(taken)]
+        assert sum(neighbours) < len(tasks) // 8

@@ -1,4 +1,4 @@
-"""Training tasks and their order: a seeded permutation per epoch, known arbitrarily far ahead."""
+"""Training tasks and their order: seeded, different in each epoch, known arbitrarily far ahead."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -158,11 +158,16 @@ class Curriculum:
         return max(1, min(count, round(share * count)))
 
 
+SCENES_AT_ONCE: Final = 32
+"""Scenes whose tasks are shuffled together. A worker that keeps its share of them loads each scene once an epoch."""
+
+
 class Schedule:
     """Endless order of tasks. ``cursor`` is its whole state: equal seeds and cursors give equal futures.
 
-    Each epoch is a permutation of all tasks. With a ``curriculum``, the first draws come from a pool that starts with the
-    shortest oracle plans. ``stream`` separates schedules with the same seed.
+    Each epoch contains every task once: scenes come in random order, and the tasks of ``SCENES_AT_ONCE`` scenes are
+    shuffled together. With a ``curriculum``, the first draws come from a pool that starts with the shortest oracle plans.
+    ``stream`` separates schedules with the same seed.
     """
 
     def __init__(
@@ -180,6 +185,11 @@ class Schedule:
         self._by_length = sorted(
             self._tasks, key=lambda task: (len(task.oracle) or UNKNOWN_LENGTH, task.task.task_id)
         )
+        by_scene: dict[str, list[TrainingTask]] = {}
+        for task in self._tasks:
+            by_scene.setdefault(task.bundle_digest, []).append(task)
+        self._scenes = tuple(by_scene.values())
+        self._epoch: tuple[int, list[TrainingTask]] = (-1, [])
         self.cursor = cursor
 
     def take(self, count: int) -> tuple[TrainingTask, ...]:
@@ -199,7 +209,17 @@ class Schedule:
             draw = np.random.default_rng(np.random.SeedSequence((*self._seed, 1, position)))
             return self._by_length[int(draw.integers(pool))]
         epoch, offset = divmod(position, len(self._tasks))
-        order = np.random.default_rng(np.random.SeedSequence((*self._seed, 0, epoch))).permutation(
-            len(self._tasks)
-        )
-        return self._tasks[int(order[offset])]
+        if self._epoch[0] != epoch:
+            self._epoch = (epoch, self._order(epoch))
+        return self._epoch[1][offset]
+
+    def _order(self, epoch: int) -> list[TrainingTask]:
+        random = np.random.default_rng(np.random.SeedSequence((*self._seed, 0, epoch)))
+        scenes = random.permutation(len(self._scenes))
+        order: list[TrainingTask] = []
+        for begin in range(0, len(scenes), SCENES_AT_ONCE):
+            together = [
+                task for scene in scenes[begin : begin + SCENES_AT_ONCE] for task in self._scenes[scene]
+            ]
+            order.extend(together[place] for place in random.permutation(len(together)))
+        return order
