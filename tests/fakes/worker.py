@@ -58,7 +58,9 @@ def completed_turn(turn, worker_id="w1", reward=PAPER):
         whole,
         steps=whole.steps[len(done) - len(further) :],
         trace_digest=f"sha256:{len(turn.plan)}",
-        observation=TurnObservation("kitchen_0", (), (f"{len(turn.plan)} calls",)),
+        observation=TurnObservation(
+            "kitchen_0", (), (f"{len(turn.plan)} calls",), turn.sight, (0, 2) if turn.sight else ()
+        ),
     )
 
 
@@ -95,6 +97,8 @@ class FakeWorker:
     """True if it reports that plans reached nothing of their goal."""
     old: bool = False
     """True if it executes turns like other rollouts, as a worker does that does not know them."""
+    blind: bool = False
+    """True if it does not say what the robot sees, as a worker does that does not know sight."""
     strange: bool = False
     """True if prefixes of turns have other digests here, as on another platform."""
     resumed: bool = False
@@ -254,7 +258,8 @@ class FakeWorker:
             mismatch = InfraFailure(InfraCode.PREFIX_MISMATCH, "expected a, found b", self.worker_id)
             self.report(lease.ref, mismatch, slot)
         elif lease.rollout.is_turn and not self.old:
-            self.report(lease.ref, completed_turn(lease.rollout, self.worker_id, lease.reward), slot)
+            turn = dataclasses.replace(lease.rollout, sight=lease.rollout.sight and not self.blind)
+            self.report(lease.ref, completed_turn(turn, self.worker_id, lease.reward), slot)
         else:
             holds = (False, False) if self.lies else (True, False)
             outcome = completed(self.worker_id, lease.reward, lease.rollout.plan, holds)

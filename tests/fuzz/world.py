@@ -30,7 +30,15 @@ from embomatrix.factory.task_import.sources import ProblemSourceError, read_eai,
 from embomatrix.factory.task_import.task_file import read_task_file
 from embomatrix.manager.web.floor_plan import floor_plan, moments_of, movable_objects
 from embomatrix.rpc.wire.rollout import skill_call_from_proto, skill_call_to_proto
-from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json, plan_to_json, plan_to_lines
+from embomatrix.skills.describe import line, read_line
+from embomatrix.skills.parse import (
+    PlanError,
+    parse_answer,
+    parse_plan,
+    plan_from_json,
+    plan_to_json,
+    plan_to_lines,
+)
 from embomatrix.skills.prompt import Codec, prompt_for, situation_of
 from embomatrix.world.bddl import ROOM_TYPES, BddlError, parse_formula, parse_problem, render_problem
 from embomatrix.world.bundle import decode_bundle, encode_bundle
@@ -290,6 +298,33 @@ def _plan(data: bytes) -> object:
     return parse_plan(text)
 
 
+def _answer(data: bytes) -> object:
+    text = text_of(data)
+    plan, done = parse_answer(text, Profile.HOUSEHOLD)
+    if plan:
+        use_plan(plan)
+        again = f"{plan_to_lines(plan)}\ndone" if done else plan_to_lines(plan)
+        assert parse_answer(again, Profile.HOUSEHOLD) == (plan, done)
+    return plan, done
+
+
+ANSWERS = (
+    b"move 3\ndone",
+    b'I see it. {"action": "open", "object_index": 2}',
+    b'```json\n[{"action": "move", "object_index": 3}, {"action": "done"}, {"action": 7}]\n```',
+    b'{"action": "done"}',
+    b"<think>open 2</think> Done.",
+    b'{"action": "move", "object_index"',
+)
+
+
+def _object_line(data: bytes) -> object:
+    text = text_of(data)
+    found = read_line(text)
+    assert read_line(line(found)) == found
+    return found
+
+
 PLANS = (
     b'[{"action": "move", "object_index": 0},'
     b' {"action": "place", "parameters": {"object_index": 3, "relation": "inside"}}]',
@@ -408,6 +443,20 @@ def table() -> dict[str, Decoder]:
             (PlanError,),
             lambda: PLANS,
             frozenset({"skills.parse:last_json_plan", "skills.parse:_found_instead"}),
+            mutate_bytes,
+        ),
+        "answer of an episode": Decoder(
+            _answer,
+            (PlanError,),
+            lambda: ANSWERS,
+            frozenset({"skills.parse:last_json_plan", "skills.parse:_found_instead"}),
+            mutate_bytes,
+        ),
+        "line about an object": Decoder(
+            _object_line,
+            (ValueError,),
+            lambda: (b"apple_1: inside fridge_1 in kitchen_0, hot, covered with dust", b"pie_2: not there"),
+            frozenset(),
             mutate_bytes,
         ),
     }

@@ -11,6 +11,7 @@ from tests.fakes.plans import plan_of
 from tests.fakes.real_cluster import RealCluster, connected
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
+from embomatrix.envs import EpisodeEnd, make
 from embomatrix.envs.turns import LocalEpisodes
 from embomatrix.rpc.episodes import Episodes
 from embomatrix.rpc.status import InvalidRequestError
@@ -53,10 +54,13 @@ def local_episodes():
 
 
 async def played(episodes, seed, calls=20):
-    """Play an episode of random parts of the script, of which many calls fail, in turns of one to three calls."""
+    """Play an episode of random parts of the script, of which many calls fail, in turns of one to three calls.
+
+    Every second one has sight.
+    """
     draw = random.Random(seed)
-    episode = episodes.begin(DIGEST, TASK.task_id, seed % 3)
-    turns = []
+    episode = episodes.begin(DIGEST, TASK.task_id, seed % 3, sight=seed % 2 == 1)
+    turns = [await episode.look()] if episode.start.sight else []
     while len(episode.calls) < calls:
         at = draw.randrange(len(CALLS))
         turns.append(await episode.act(CALLS[at : at + draw.randint(1, 3)]))
@@ -155,11 +159,34 @@ async def test_local_episode_checks_its_prefix_too():
             await episode.act([CALLS[1]])
 
 
-async def test_examples_of_the_page_run_and_agree(tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "episodes.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "episodes.md").read_text(encoding="utf-8")
+
+
+def names_of_the_page():
+    """Execute the blocks of Python and return what they define."""
     names = {}
-    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+    for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
         exec(compile(block, "docs/episodes.md", "exec"), names)
+    return names
+
+
+def test_first_example_of_the_page_plays_the_printed_episode():
+    [printed] = re.findall(r"```text\n(Rooms: .*?)```", PAGE, re.DOTALL)
+    answers = re.findall(r"^> (.+)$", printed, re.MULTILINE)
+    [(task_id, seed)] = re.findall(r"the shipped task `([^`]+)` .* with seed (\d+)", PAGE)
+    with make("starter", visibility="seen") as environment:
+        said = [environment.reset(task_id, seed=int(seed)).user]
+        observations = [environment.step(answer) for answer in answers]
+    said += [f"\n> {answer}\n{each.text}" for answer, each in zip(answers, observations, strict=True)]
+    assert "\n".join(said) == printed.rstrip("\n")
+    assert observations[-1].end is EpisodeEnd.DONE
+    assert observations[-1].reward.tiers.success
+    end, reward, conversation = names_of_the_page()["play"](lambda conversation: "done")
+    assert (end, reward, len(conversation)) == (EpisodeEnd.DONE, -1.0, 4)
+
+
+async def test_examples_of_the_page_run_and_agree(tmp_path):
+    names = names_of_the_page()
     async with real_cluster(tmp_path, "w1") as (cluster, _, _):
         far = await names["play_on_a_cluster"](cluster.address, DATA, TASK.task_id)
     near = await names["play_here"](DATA, TASK.task_id)

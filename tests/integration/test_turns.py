@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import dataclasses
 import functools
 
 import pytest
@@ -162,6 +163,24 @@ async def test_mismatch_is_tried_on_another_worker(tmp_path):
         assert {type(result.outcome) for result in results} == {Completed}
         assert {result.outcome.worker_id for result in results} == {"sound"}
         assert strange.executed
+
+
+async def test_worker_that_does_not_know_sight_is_passed_over(tmp_path):
+    (blind,) = turns(1)
+    (looking,) = [dataclasses.replace(turn, sight=True, plan=turn.plan[:1]) for turn in turns(1, first=1)]
+    async with (
+        manager(tmp_path) as at,
+        trainer(at.address) as client,
+        FakeWorker(at.address, "old", blind=True),
+    ):
+        results = await client.step("r1", [blind, looking])
+        assert isinstance(results[0].outcome, Completed)
+        assert results[1].outcome.code is InfraCode.VERSION_SKEW
+        assert "old does not know sight in episodes: upgrade it" in results[1].outcome.message
+        async with FakeWorker(at.address, "new"):
+            (result,) = await client.step("r1", [looking])
+        assert (result.outcome.worker_id, result.outcome.observation.sees) == ("new", (0, 2))
+        assert result.outcome.steps == ()
 
 
 async def test_worker_that_does_not_know_turns_is_passed_over(tmp_path):

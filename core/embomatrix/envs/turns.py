@@ -56,12 +56,14 @@ class LocalEpisodes:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def begin(self, bundle_digest: str, task_id: str, seed: int = 0) -> RunningEpisode:
+    def begin(
+        self, bundle_digest: str, task_id: str, seed: int = 0, *, sight: bool = False
+    ) -> RunningEpisode:
         """Begin an episode. Its scene is loaded with its first turn.
 
         A turn raises KeyError for an unknown task, besides what ``RunningEpisode.act`` and reading and loading raise.
         """
-        return RunningEpisode(EpisodeStart(bundle_digest, task_id, seed), self._take_turn)
+        return RunningEpisode(EpisodeStart(bundle_digest, task_id, seed, sight), self._take_turn)
 
     def close(self) -> None:
         """Free every simulator."""
@@ -77,7 +79,7 @@ class LocalEpisodes:
         if task is None:
             name = f"bundle {start.bundle_digest} has no task {start.task_id!r}"
             raise KeyError(f"{name}: expected one of its {len(tasks)} tasks")
-        run, judgement, _ = scene.tree.execute_turn(task, plan, start.seed, prefix.length)
+        run, judgement, _ = scene.tree.execute_turn(task, plan, start.seed, prefix.length, sight=start.sight)
         prefix.check(run.steps[: prefix.length], run.prefix_digest)
         return Turn(
             run.steps[prefix.length :],

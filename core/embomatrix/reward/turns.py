@@ -29,11 +29,15 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeStart:
-    """Start of an episode: a task of a bundle, and the seed that decides between equally good outcomes."""
+    """Start of an episode: a task of a bundle, and the seed that decides between equally good outcomes.
+
+    With ``sight``, observations name the rows of the task's table that the robot sees.
+    """
 
     bundle_digest: str
     task_id: str
     seed: int
+    sight: bool = False
 
 
 TakeTurn = Callable[[EpisodeStart, "Plan", EpisodePrefix], Awaitable[Turn]]
@@ -55,16 +59,26 @@ class RunningEpisode:
         self._take_turn = take_turn
         self._acting = False
 
+    async def look(self) -> Turn:
+        """Observe the present state without a call, in an episode with sight. Counts as no call.
+
+        Raises what ``act`` raises.
+        """
+        return await self._take(())
+
     async def act(self, calls: Sequence[SkillCall]) -> Turn:
         """Execute further calls, up to the first that fails. After an error the episode is as before, and may act again.
 
         Raises EpisodeOverError for no call and for more than 64 in all, PrefixMismatchError if the calls so far have other
         outcomes now, and RuntimeError during another turn of this episode.
         """
+        check_length(self.calls, tuple(calls))
+        return await self._take(tuple(calls))
+
+    async def _take(self, further: Plan) -> Turn:
         if self._acting:
             raise RuntimeError("the episode is within a turn: await it before the next one")
-        further = tuple(calls)
-        check_length(self.calls, further)
+        check_length(self.calls, further, looks=self.start.sight)
         self._acting = True
         try:
             turn = await self._take_turn(self.start, (*self.calls, *further), self.prefix)

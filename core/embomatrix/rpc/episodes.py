@@ -80,18 +80,29 @@ class Episodes:
             task.cancel()
         await asyncio.gather(*self._sending, return_exceptions=True)
 
-    def begin(self, bundle_digest: str, task_id: str, seed: int = 0) -> RunningEpisode:
+    def begin(
+        self, bundle_digest: str, task_id: str, seed: int = 0, *, sight: bool = False
+    ) -> RunningEpisode:
         """Begin an episode, without a call to the manager.
 
         Besides what ``RunningEpisode.act`` says, a turn raises InvalidRequestError for an unknown task and for a skill outside
         its profile, PreconditionError if the manager lacks the bundle, NotFoundError if the run is not open, TurnFailedError if
         no worker could execute it, and DeadlineError or UnavailableError after the client's time limit for a turn.
         """
-        return RunningEpisode(EpisodeStart(bundle_digest, task_id, seed), self._take_turn)
+        return RunningEpisode(EpisodeStart(bundle_digest, task_id, seed, sight), self._take_turn)
 
     async def _take_turn(self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix) -> Turn:
         name = str(next(self._numbers))
-        rollout = Rollout(name, name, start.bundle_digest, start.task_id, plan, start.seed, prefix=prefix)
+        rollout = Rollout(
+            name,
+            name,
+            start.bundle_digest,
+            start.task_id,
+            plan,
+            start.seed,
+            prefix=prefix,
+            sight=start.sight,
+        )
         awaited = _AwaitedTurn(rollout, asyncio.get_running_loop().create_future())
         self._waiting.append(awaited)
         self._gather()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
-    from embomatrix.world.geometry import Aabb, Pose
+    from embomatrix.world.geometry import Aabb, Pose, Vec3
     from embomatrix.world.scene import Scene
 
 WALL: Final = "wall"
@@ -131,6 +131,12 @@ class PhysicsEngine(Protocol):
 
     def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
         """Objects whose bounding boxes overlap the box, in scene order; parked ones are left out."""
+
+    def first_met(self, start_m: Vec3, ends_m: Sequence[Vec3]) -> tuple[str, ...]:
+        """Name of the first body on the straight way from a point to each other point; "" for none.
+
+        ``WALL`` and ``BACKGROUND`` are names too. The floor and parked objects are never met.
+        """
 
     def is_at_static(self, box: Aabb) -> bool:
         """Return True if the bounding box of a wall or of a background object overlaps the box."""

@@ -13,6 +13,7 @@ import numpy as np
 from embomatrix.sim.actions import CachedActor
 from embomatrix.sim.engine import PhysicsEngine
 from embomatrix.sim.live_world import LiveWorld, WorldMark
+from embomatrix.sim.sight import rows_in_sight
 from embomatrix.sim.state.sources import Change
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
@@ -267,7 +268,14 @@ class Simulator:
         )
 
     def execute_turn(
-        self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None] = lambda _: None
+        self,
+        task: Task,
+        plan: Plan,
+        seed: int,
+        prefix: int,
+        on_step: Callable[[int], None] = lambda _: None,
+        *,
+        sight: bool = False,
     ) -> TurnRun:
         """Reset and run the plan. Failures end it only after the first ``prefix`` calls."""
         self.reset(task, seed)
@@ -279,7 +287,7 @@ class Simulator:
         self._run_to_failure(plan[prefix:], steps, on_step)
         end = self.mark()
         digests = start.digest(seed), end.digest(seed)
-        return TurnRun(tuple(steps), *digests, end.touched, self.observe(task, before))
+        return TurnRun(tuple(steps), *digests, end.touched, self.observe(task, before, sight=sight))
 
     def describe(self, task: Task) -> tuple[str, ...]:
         """State in words of the goal's objects and of those that a call succeeded on, in the table's order."""
@@ -291,11 +299,17 @@ class Simulator:
         """State in words of every object in the task's table, in its order; it reveals nothing about the goal."""
         return final_lines([self._description(name) for name in task.table])
 
-    def observe(self, task: Task, before: WorldMark) -> TurnObservation:
-        """Describe the present state and what has changed since another state of this task."""
+    def observe(self, task: Task, before: WorldMark, *, sight: bool = False) -> TurnObservation:
+        """Describe the present state and what has changed since another state of this task.
+
+        With ``sight``, say which rows of the table the robot sees.
+        """
         changed = self.world.mark().changed_since(before)
         descriptions = [self._description(name) for name in task.table if name in changed]
-        return TurnObservation(self.world.robot_room, self.world.carried, final_lines(descriptions))
+        sees = rows_in_sight(self.world) if sight else ()
+        return TurnObservation(
+            self.world.robot_room, self.world.carried, final_lines(descriptions), sight, sees
+        )
 
     def warm_up(self) -> Iterator[None]:
         """Compute cached values ahead of their first use, a little per step. Changes no answer.

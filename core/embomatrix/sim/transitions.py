@@ -45,8 +45,8 @@ class _Node(Generic[T]):
     """Trace and judgement of a plan that ends here. Those of other plans differ in the plan alone."""
     world: WorldMark | None = None
     """State of the world where the mark lacks it, if a turn has begun here."""
-    turn: tuple[int, TurnObservation, T] | None = None
-    """Prefix, observation and judgement of a turn that ended here."""
+    turn: tuple[tuple[int, bool], TurnObservation, T] | None = None
+    """Prefix and sight, observation and judgement of a turn that ended here."""
     children: dict[_Key, _Node[T]] = field(default_factory=dict)
 
 
@@ -87,7 +87,14 @@ class TransitionTree(Generic[T]):
         return replace(trace, plan=plan), judgement, shared
 
     def execute_turn(
-        self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None] = lambda _: None
+        self,
+        task: Task,
+        plan: Plan,
+        seed: int,
+        prefix: int,
+        on_step: Callable[[int], None] = lambda _: None,
+        *,
+        sight: bool = False,
     ) -> tuple[TurnRun, T, int]:
         """Return the run of a turn, the judgement of its end, and the number of its steps that were known.
 
@@ -97,10 +104,11 @@ class TransitionTree(Generic[T]):
         self._mark_of(self._start(task), task, seed)  # while the simulator is there, if it must go there
         nodes, shared = self._walk(task, plan, seed, prefix, on_step)
         begin, end = nodes[prefix], nodes[-1]
-        if end.turn is None or end.turn[0] != prefix:
+        if end.turn is None or end.turn[0] != (prefix, sight):
             before = self._world_at(begin, task, seed)
             self._go_to(end, task, seed)
-            end.turn = prefix, self._simulator.observe(task, before), self._judge(task)
+            observation = self._simulator.observe(task, before, sight=sight)
+            end.turn = (prefix, sight), observation, self._judge(task)
         _, observation, judgement = end.turn
         first, last = self._mark_of(begin, task, seed), self._mark_of(end, task, seed)
         self._use(end)

@@ -1,5 +1,6 @@
 """Observations in words: the effect of a step, and the final state of objects."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -40,6 +41,10 @@ WORDS: Final[Mapping[Relation, str]] = {
     Relation.INROOM: "in",
 }
 """Preposition of each relation."""
+GONE: Final = "not there"
+"""Place of an object that is not in the world."""
+NO_ROOM: Final = "no room"
+"""Place of an object between rooms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +85,38 @@ def gained(changes: Mapping[str, Sequence[str]]) -> str:
 def line(item: ObjectDescription) -> str:
     """Describe one object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
     if item.gone:
-        return f"{item.name}: not there"
-    place = "in the robot's hand" if item.held else f"in {item.room or 'no room'}"
+        return f"{item.name}: {GONE}"
+    place = _IN_HAND if item.held else f"in {item.room or NO_ROOM}"
     if item.host and item.relation is not None:
         place = f"{WORDS[item.relation]} {item.host} {place}"
     return f"{item.name}: {', '.join([place, *item.states])}"
+
+
+_PLACES: Final = {word: relation for relation, word in WORDS.items()}
+_IN_HAND: Final = "in the robot's hand"
+_LINE: Final = re.compile(
+    rf"(?P<name>[^:]+): (?:(?P<relation>{'|'.join(sorted(_PLACES, key=len, reverse=True))}) (?P<host>\S+) )?"
+    rf"(?:(?P<hand>{_IN_HAND})|in (?P<room>no room|[^\s,]+))(?P<states>(?:, [^,]+)*)"
+)
+
+
+def read_line(text: str) -> ObjectDescription:
+    """Read what ``line`` writes. Raises ValueError for another text."""
+    name, _, rest = text.partition(": ")
+    if rest == GONE:
+        return ObjectDescription(name, "", gone=True)
+    found = _LINE.fullmatch(text)
+    if found is None:
+        raise ValueError(f"{text[:80]!r} does not describe an object: expected `name: in room, states`")
+    room = found["room"] or ""
+    return ObjectDescription(
+        name=found["name"],
+        room="" if room == NO_ROOM else room,
+        host=found["host"] or "",
+        relation=_PLACES[found["relation"]] if found["host"] else None,
+        held=found["hand"] is not None,
+        states=tuple(found["states"].split(", ")[1:]),
+    )
 
 
 def final_lines(described: Sequence[ObjectDescription]) -> tuple[str, ...]:

@@ -6,10 +6,11 @@ a model reasons first and answers last. Compact: calls on lines or between semic
 arguments in the order of ``SIGNATURES``. Skills outside the task's profile count as unknown.
 """
 
+import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import Any, Final, cast
 
@@ -49,6 +50,8 @@ class PlanError(ValueError):
 
 
 PLAN_KEYS: Final = ("action_sequence", "plan")
+DONE: Final = "done"
+"""Answer that ends an episode."""
 MAX_INDEX: Final = 2**63 - 1
 """Largest index that the wire format carries."""
 _MAX_STARTS: Final = 256
@@ -66,17 +69,32 @@ _ARGUMENT: Final = re.compile(
 
 def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
     """Return the last plan in the text. Raises PlanError, and no other exception, for any text."""
-    size = len(text.encode("utf-8", errors="replace"))
-    if size > MAX_PLAN_BYTES:
-        raise PlanError(
-            PlanReason.TOO_LONG,
-            f"the text has {size} bytes: expected at most {MAX_PLAN_BYTES}; shorten the plan",
-        )
-    answer = _without_reasoning(text)
+    answer = _answer_in(text)
     value = last_json_plan(answer, json.JSONDecoder())
     if value is not None:
         return plan_from_json(value, profile)
     return _parse_lines(answer, profile)
+
+
+def parse_answer(text: str, profile: Profile = Profile.PAPER) -> tuple[Plan, bool]:
+    """Return the calls of an answer within an episode, and whether ``DONE`` follows them.
+
+    The forms are those of a plan, and a JSON object with one call. ``DONE`` is a line, or the action of a JSON call; what
+    follows it is left out. Raises PlanError, and no other exception, for a text with neither.
+    """
+    answer = _answer_in(text)
+    value = last_json_plan(answer, json.JSONDecoder(), _calls_in)
+    if value is not None:
+        values = _calls_in(value) or ()
+        before = [*itertools.takewhile(lambda step: not _is_done(step), values)]
+        done = len(before) < len(values)
+        return (plan_from_json(before, profile) if before or not done else ()), done
+    segments = [*_segments(answer)]
+    lines = [*itertools.takewhile(lambda words: not _ends(words), segments)]
+    done = len(lines) < len(segments)
+    if done and not any(_is_call(words, profile) for words in lines):
+        return (), True
+    return _parse_lines("\n".join(map(" ".join, lines)) if done else answer, profile), done
 
 
 def prose_lines(text: str, profile: Profile) -> list[str]:
@@ -121,6 +139,33 @@ def argument(call: SkillCall, arg: Arg) -> int | float | str | None:
     return value.value if isinstance(value, PlaceRelation) else value
 
 
+def _answer_in(text: str) -> str:
+    """Return the text without its reasoning. Raises PlanError for one that is too long."""
+    size = len(text.encode("utf-8", errors="replace"))
+    if size > MAX_PLAN_BYTES:
+        raise PlanError(
+            PlanReason.TOO_LONG,
+            f"the text has {size} bytes: expected at most {MAX_PLAN_BYTES}; shorten the plan",
+        )
+    return _without_reasoning(text)
+
+
+def _calls_in(value: object) -> Sequence[object] | None:
+    """Return the array of calls in a JSON value, that of a single call included; None if there is none."""
+    if isinstance(value, dict) and isinstance(value.get("action"), str):
+        return [value]
+    return _steps_in(value)
+
+
+def _is_done(value: object) -> bool:
+    action = value.get("action") if isinstance(value, dict) else None
+    return isinstance(action, str) and _ends(action.split())
+
+
+def _ends(words: Sequence[str]) -> bool:
+    return len(words) == 1 and words[0].lower().rstrip(".") == DONE
+
+
 def _without_reasoning(text: str) -> str:
     """Return the text after the last </think>, or all of it if nothing follows."""
     answer = text.rpartition("</think>")[2]
@@ -145,8 +190,15 @@ def _steps_in(value: object) -> Sequence[object] | None:
     return None
 
 
-def last_json_plan(text: str, decoder: json.JSONDecoder) -> object | None:
-    """Return the last outermost JSON value that holds a plan. Reads about ``_READ_TIMES`` times the text at most."""
+def last_json_plan(
+    text: str,
+    decoder: json.JSONDecoder,
+    calls_in: Callable[[object], Sequence[object] | None] = _steps_in,
+) -> object | None:
+    """Return the last outermost JSON value that holds a plan. Reads about ``_READ_TIMES`` times the text at most.
+
+    ``calls_in`` returns the calls in a value, None for one without.
+    """
     found: object | None = None
     position, left = 0, _READ_TIMES * len(text)
     for _ in range(_MAX_STARTS):
@@ -159,7 +211,7 @@ def last_json_plan(text: str, decoder: json.JSONDecoder) -> object | None:
             left -= _end_of_failure(error, text) - match.start()
             position = match.start() + 1
             continue
-        if _steps_in(value) is not None:
+        if calls_in(value) is not None:
             found = value
     return found
 

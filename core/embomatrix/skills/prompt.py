@@ -13,7 +13,7 @@ A prompt covers the rows of the task's object table and never contains the goal 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
@@ -74,6 +74,12 @@ class Situation:
     instruction: str
     table_size: int
     profile: Profile = Profile.PAPER
+    home: tuple[str, ...] = ()
+    """All rooms of the scene."""
+    held: tuple[str, ...] = ()
+    """Name of the object in the robot's hand, then those of its contents."""
+    full_names: bool = False
+    """Rows have their full names, because further rows may come to be known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +95,8 @@ def situation_of(scene: Scene, task: Task) -> Situation:
     listed = set(task.table)
     rows = tuple(_row(index, scene.by_name[name], scene, listed) for index, name in enumerate(task.table))
     rooms = tuple(dict.fromkeys([*(row.room for row in rows if row.room), scene.robot.room]))
-    return Situation(rooms, scene.robot.room, rows, task.instruction, len(task.table), task.profile)
+    home = tuple(room.name for room in scene.rooms)
+    return Situation(rooms, scene.robot.room, rows, task.instruction, len(task.table), task.profile, home)
 
 
 def _row(index: int, item: SceneObject, scene: Scene, listed: set[str]) -> PromptRow:
@@ -163,6 +170,8 @@ def plain_words(text: str) -> str:
 
 def labels(situation: Situation) -> dict[int, str]:
     """Map row indices to shortest unique names: the category if only one row has it, else the name."""
+    if situation.full_names:
+        return {row.index: row.name for row in situation.rows}
     counts: dict[str, int] = {}
     for row in situation.rows:
         counts[row.category] = counts.get(row.category, 0) + 1
@@ -177,13 +186,17 @@ def prompt_for(situation: Situation, codec: Codec) -> Prompt:
 
 
 def _tree(situation: Situation) -> dict[str, list[tuple[PromptRow, list[PromptRow]]]]:
-    """Map rooms to their rows with contents. A hosted row gets its own entry only if it hosts other rows."""
+    """Map rooms to their rows with contents. A hosted row gets its own entry only if it hosts other rows.
+
+    What the robot holds is left out.
+    """
+    placed = [row for row in situation.rows if row.name not in situation.held]
     contents: dict[str, list[PromptRow]] = {}
-    for row in situation.rows:
+    for row in placed:
         if row.host:
             contents.setdefault(row.host, []).append(row)
     tree: dict[str, list[tuple[PromptRow, list[PromptRow]]]] = {}
-    for row in situation.rows:
+    for row in placed:
         inside = contents.get(row.name, [])
         if inside or not row.host:
             tree.setdefault(row.room, []).append((row, inside))
@@ -205,17 +218,30 @@ def _names_text(situation: Situation) -> str:
         return " ".join([label[row.index], *row.states])
 
     lines: list[str] = []
+    hand = ["holds", *map(words, held_rows(situation))] if situation.held else []
     for room, entries in _tree(situation).items():
         lines.append(f"room {room}")
         for row, contents in entries:
             groups = [f"{word} {' '.join(map(words, rows))}" for word, rows in _by_relation(contents)]
             lines.append(" ".join([words(row), *groups]))
-    return "\n".join([*lines, f"robot {situation.robot_room}", f"task {situation.instruction}"])
+    robot = " ".join(["robot", situation.robot_room, *hand])
+    return "\n".join([*lines, robot, f"task {situation.instruction}"])
+
+
+def held_rows(situation: Situation) -> list[PromptRow]:
+    """Rows of the object in the robot's hand and its contents."""
+    by_name = {row.name: row for row in situation.rows}
+    return [by_name[name] for name in situation.held if name in by_name]
+
+
+def indexed(row: PromptRow) -> str:
+    """Name of a row for language models: its category, and its index in the table."""
+    return f"{row.category.replace('_', ' ')} {row.index}"
 
 
 def _indexed_text(situation: Situation) -> str:
     def words(row: PromptRow) -> str:
-        return " ".join([row.category.replace("_", " "), str(row.index), *row.states])
+        return " ".join([indexed(row), *row.states])
 
     lines = ["Scene:"]
     for room, entries in _tree(situation).items():
@@ -223,9 +249,16 @@ def _indexed_text(situation: Situation) -> str:
         for row, contents in entries:
             groups = [f"{word}: {', '.join(map(words, rows))}" for word, rows in _by_relation(contents)]
             lines.append(" ".join([words(row), *groups]))
-    lines.append(f"Robot: {situation.robot_room or 'unknown room'}, hand empty")
+    lines.append(robot_in_words(situation.robot_room, [*map(words, held_rows(situation))]))
     lines.append(f"Task: {situation.instruction}")
     return "\n".join(lines)
+
+
+def robot_in_words(room: str, held: Sequence[str]) -> str:
+    """Line about the robot for language models: its room, and the named object in its hand with its contents."""
+    hand = f"holding {held[0]}" if held else "hand empty"
+    inside = f" with {', '.join(held[1:])} in it" if held[1:] else ""
+    return f"Robot: {room or 'unknown room'}, {hand}{inside}"
 
 
 _PLACEHOLDERS: Final[Mapping[Arg, str]] = {
@@ -248,14 +281,16 @@ EXAMPLES: Final[Mapping[Codec, str]] = {
 """Example plan in each codec: put the apple (row 4) into the fridge (row 2)."""
 
 
-def _skill_lines(profile: Profile) -> str:
+def skill_lines(profile: Profile) -> str:
+    """Skills of a profile with their arguments, as calls on lines."""
     return " | ".join(
         " ".join([skill.value, *(_PLACEHOLDERS[argument] for argument in SIGNATURES[skill])])
         for skill in PROFILES[profile]
     )
 
 
-def _skill_objects(profile: Profile) -> str:
+def skill_objects(profile: Profile) -> str:
+    """Skills of a profile with their arguments, as JSON objects."""
     return "\n".join(
         "{"
         + ", ".join(
@@ -266,28 +301,29 @@ def _skill_objects(profile: Profile) -> str:
     )
 
 
-_RULES: Final = (
+RULES: Final = (
     "The robot has one arm and holds one object; doors and switches need the empty hand. Move to an object before you "
     "use it, open closed containers before you pick up what goes inside. "
-    "Objects are called by the number that follows their name. The plan stops at the first step that fails."
+    "Objects are called by the number that follows their name."
 )
+_STOPS: Final = " The plan stops at the first step that fails."
 _HOUSEHOLD_RULES: Final = (
     " Slice, wipe and brush with the tool in the hand, which is the source; a sink or a machine that runs washes what lies "
     "in it. A cloth takes dust off dry, and stains when it is soaked. What is absent comes when another object is sliced."
 )
-_ADDED_RULES: Final[Mapping[Profile, str]] = {Profile.PAPER: "", Profile.HOUSEHOLD: _HOUSEHOLD_RULES}
+ADDED_RULES: Final[Mapping[Profile, str]] = {Profile.PAPER: "", Profile.HOUSEHOLD: _HOUSEHOLD_RULES}
 
 
 def _system(codec: Codec, profile: Profile) -> str:
-    rules = f"{_RULES}{_ADDED_RULES[profile]}\nExample, put apple 4 into fridge 2:\n{EXAMPLES[codec]}"
+    rules = f"{RULES}{_STOPS}{ADDED_RULES[profile]}\nExample, put apple 4 into fridge 2:\n{EXAMPLES[codec]}"
     if codec is Codec.LINES:
         return (
             "You control a home robot. Answer only with the plan, one action a line.\n"
-            f"Actions: {_skill_lines(profile)}\n{rules}"
+            f"Actions: {skill_lines(profile)}\n{rules}"
         )
     return (
         "You control a home robot. Answer only with the plan, a JSON list of actions.\n"
-        f"Actions:\n{_skill_objects(profile)}\n{rules}"
+        f"Actions:\n{skill_objects(profile)}\n{rules}"
     )
 
 

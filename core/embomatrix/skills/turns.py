@@ -64,11 +64,15 @@ class TurnObservation:
     changes: tuple[str, ...]
     """One line for each object of the task's table that the turn has changed or moved, in the table's order, as ``final_lines``
     writes them."""
+    looked: bool = False
+    """True in episodes with sight: ``sees`` is set."""
+    sees: tuple[int, ...] = ()
+    """Rows of the task's table that the robot sees, rising."""
 
 
-def check_length(prefix: Plan, calls: Plan) -> None:
-    """Raise EpisodeOverError unless an episode may go on with these calls."""
-    if not calls:
+def check_length(prefix: Plan, calls: Plan, *, looks: bool = False) -> None:
+    """Raise EpisodeOverError unless an episode may go on with these calls. A turn that ``looks`` may have none."""
+    if not calls and not looks:
         raise EpisodeOverError("a turn has no call: expected at least one skill call")
     if len(prefix) + len(calls) > MAX_STEPS:
         raise EpisodeOverError(

@@ -107,8 +107,8 @@ def test_tree_forgets_what_was_not_used_for_longest(home, task):
     assert [tree.execute(task, plan, 0)[2] for plan in (new, third, old)] == [2, 1, 0]
 
 
-def plain_turn(simulator, task, plan, seed, prefix):
-    run = simulator.execute_turn(task, plan, seed, prefix)
+def plain_turn(simulator, task, plan, seed, prefix, *, sight=False):
+    run = simulator.execute_turn(task, plan, seed, prefix, sight=sight)
     return run, score(task, run.touched, simulator.facts)
 
 
@@ -128,9 +128,12 @@ def test_turns_through_a_tree_of_any_size_equal_plain_ones(home, texts, most, da
         alone = call_alone(home[1], task, plan, seed)
         prefix = 0
         while prefix < len(plan):
+            sight = data.draw(st.booleans())
+            looked, judged, _ = tree.execute_turn(task, plan[:prefix], seed, prefix, sight=True)
+            assert (looked, judged) == plain_turn(home[1], task, plan[:prefix], seed, prefix, sight=True)
             end = data.draw(st.integers(prefix + 1, len(plan)))
-            run, judged, _ = tree.execute_turn(task, plan[:end], seed, prefix)
-            assert (run, judged) == plain_turn(home[1], task, plan[:end], seed, prefix)
+            run, judged, _ = tree.execute_turn(task, plan[:end], seed, prefix, sight=sight)
+            assert (run, judged) == plain_turn(home[1], task, plan[:end], seed, prefix, sight=sight)
             assert list(run.steps) == [step for step, _ in alone[: len(run.steps)]]
             assert run.digest == alone[len(run.steps) - 1][1]
             assert all(step.ok for step in run.steps[prefix:-1])

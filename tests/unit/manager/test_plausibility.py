@@ -15,6 +15,7 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.skills.trace import Step
 from embomatrix.skills.turns import EpisodePrefix
+from embomatrix.world.task import MAX_TABLE
 
 PLAN = (SkillCall(Skill.MOVE, object_index=3), SkillCall(Skill.OPEN, object_index=4))
 ROLLOUT = Rollout("x1", "g", "kitchen", "t", PLAN, 1)
@@ -82,8 +83,17 @@ def test_every_reward_that_can_be_computed_is_accepted(settings, holds, objects)
 TURN = dataclasses.replace(ROLLOUT, plan=(*PLAN, *PLAN), prefix=EpisodePrefix(2, (1,), "sha256:a"))
 
 
-def test_honest_turn_reports_the_steps_after_its_prefix():
-    assert contradiction(completed_turn(TURN), TURN, PAPER) == ""
+LOOK = dataclasses.replace(TURN, plan=PLAN, sight=True)
+
+
+def sees(*rows):
+    honest = completed_turn(LOOK)
+    return dataclasses.replace(honest, observation=dataclasses.replace(honest.observation, sees=rows))
+
+
+@pytest.mark.parametrize("turn", [TURN, LOOK, dataclasses.replace(TURN, sight=True)])
+def test_honest_turn_reports_the_steps_after_its_prefix(turn):
+    assert contradiction(completed_turn(turn), turn, PAPER) == ""
 
 
 def test_prefix_that_failed_earns_no_relevance():
@@ -107,6 +117,10 @@ def test_prefix_that_failed_earns_no_relevance():
             "4 steps for a plan of 2 calls",
         ),
         (dataclasses.replace(completed_turn(TURN), steps=()), TURN, "ends after 0 of 2"),
+        (completed_turn(LOOK), dataclasses.replace(LOOK, sight=False), "its turn is without sight"),
+        (sees(2, 1), LOOK, "no rising indices"),
+        (sees(1, 1), LOOK, "no rising indices"),
+        (sees(MAX_TABLE), LOOK, "no rising indices"),
     ],
 )
 def test_impossible_turn_is_named(result, turn, reason):

@@ -74,9 +74,10 @@ ROLLOUTS = st.builds(
     render=st.booleans(),
 )
 TURNS = st.builds(
-    lambda rollout, calls, failed, digest: dataclasses.replace(
+    lambda rollout, calls, failed, digest, sight: dataclasses.replace(
         rollout,
         plan=tuple(calls),
+        sight=sight,
         prefix=EpisodePrefix(
             len(calls) - 1, tuple(sorted(index for index in failed if index < len(calls) - 1)), digest
         ),
@@ -85,9 +86,15 @@ TURNS = st.builds(
     st.lists(CALLS, min_size=1, max_size=5),
     st.sets(st.integers(0, 4)),
     TEXTS,
+    st.booleans(),
 )
 OBSERVATIONS = st.builds(
-    TurnObservation, TEXTS, st.lists(TEXTS, max_size=3).map(tuple), st.lists(TEXTS, max_size=3).map(tuple)
+    TurnObservation,
+    TEXTS,
+    st.lists(TEXTS, max_size=3).map(tuple),
+    st.lists(TEXTS, max_size=3).map(tuple),
+    st.booleans(),
+    st.lists(UINT32, max_size=3).map(tuple),
 )
 REWARDS = st.builds(
     RewardBreakdown,
@@ -182,6 +189,17 @@ def test_malformed_prefix_is_named(prefix, calls, problem):
     with pytest.raises(ConvertError) as caught:
         convert.turn_from_proto(turn)
     assert problem in str(caught.value)
+
+
+def test_turn_with_sight_may_have_no_further_call():
+    turn = Rollout("r", "g", "b", "t", (CALL,), 0, prefix=EpisodePrefix(1), sight=True)
+    assert convert.turn_from_proto(_over_the_wire(convert.rollout_to_proto(turn))) == turn
+    beyond = convert.rollout_to_proto(dataclasses.replace(turn, prefix=EpisodePrefix(2)))
+    with pytest.raises(ConvertError, match=r"found 2 of 1 calls: expected no more than the plan has"):
+        convert.turn_from_proto(beyond)
+    no_turn = convert.rollout_to_proto(dataclasses.replace(turn, prefix=None))
+    with pytest.raises(ConvertError, match="sight: found it without a prefix"):
+        convert.rollout_from_proto(no_turn)
 
 
 def test_repeated_turn_is_named():

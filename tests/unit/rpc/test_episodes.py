@@ -74,6 +74,22 @@ async def test_episode_sends_all_its_calls_and_the_digest_after_them():
     assert (two.bundle_digest, two.task_id, two.seed) == ("sha256:0", "task", 7)
 
 
+async def test_episode_with_sight_looks_without_a_call():
+    client = FakeClient()
+    async with Episodes(client, "run-1") as episodes:
+        episode = episodes.begin("sha256:0", "task", sight=True)
+        first = await episode.look()
+        await episode.act([CALL])
+        with pytest.raises(EpisodeOverError, match="a turn has no call"):
+            await episode.act([])
+        with pytest.raises(EpisodeOverError, match="a turn has no call"):
+            await episodes.begin("sha256:0", "task").look()
+    assert (first.steps, first.observation.sees) == ((), (0, 2))
+    (look,), (act,) = client.calls
+    assert (look.plan, look.prefix, look.sight) == ((), EpisodePrefix(), True)
+    assert (act.plan, act.prefix, act.sight) == ((CALL,), EpisodePrefix(0, (), "sha256:0"), True)
+
+
 async def test_turns_that_are_awaited_together_share_calls():
     client = FakeClient()
     async with Episodes(client, "run-1") as episodes:

@@ -1,5 +1,11 @@
 """Observations in words."""
 
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
 from embomatrix.skills.describe import (
     MAX_FINAL_LINES,
     ObjectDescription,
@@ -8,6 +14,7 @@ from embomatrix.skills.describe import (
     gained,
     line,
     listed,
+    read_line,
 )
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.state import Relation
@@ -57,3 +64,39 @@ def test_long_final_description_is_cut_with_a_remark():
     assert len(lines) == MAX_FINAL_LINES + 1
     assert lines[-1] == "and 3 more objects"
     assert final_lines(described[:2]) == ("apple_0: in kitchen_0", "apple_1: in kitchen_0")
+
+
+NAMES = st.from_regex(r"[a-z]{1,8}(_[a-z]{1,5})?_[0-9]{1,2}", fullmatch=True)
+STATES = st.lists(st.sampled_from(["open", "closed", "on", "hot", "covered with dust", "soaked"]), max_size=3)
+
+
+@given(
+    st.builds(
+        ObjectDescription,
+        NAMES,
+        st.just("") | NAMES,
+        st.just("") | NAMES,
+        st.sampled_from(Relation),
+        st.booleans(),
+        st.just(value=False),
+        STATES.map(tuple),
+    )
+)
+def test_description_is_read_back(item):
+    read = read_line(line(item))
+    expected = dataclasses.replace(
+        item, room="" if item.held else item.room, relation=item.relation if item.host else None
+    )
+    assert read == expected
+
+
+def test_object_that_is_gone_is_read_back():
+    assert read_line(line(ObjectDescription("apple_1", "kitchen_0", gone=True))) == ObjectDescription(
+        "apple_1", "", gone=True
+    )
+
+
+@pytest.mark.parametrize("text", ["", "and 3 more objects", "apple_1", "apple_1: somewhere", "apple_1: in "])
+def test_other_lines_describe_no_object(text):
+    with pytest.raises(ValueError, match="does not describe an object"):
+        read_line(text)

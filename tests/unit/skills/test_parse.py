@@ -11,6 +11,7 @@ from embomatrix.skills.parse import (
     PlanError,
     PlanReason,
     last_json_plan,
+    parse_answer,
     parse_plan,
     plan_from_json,
     plan_to_json,
@@ -297,3 +298,31 @@ def test_work_on_brackets_that_never_close_grows_linearly(piece):
         decoder, text = CountingDecoder(), piece * (size // len(piece))
         assert last_json_plan(text, decoder) is None
         assert decoder.read <= 9 * size
+
+
+@pytest.mark.parametrize(
+    ("text", "calls", "done"),
+    [
+        ("move 3", 1, False),
+        ("done", 0, True),
+        ("Done.", 0, True),
+        ("I see the apple.\nmove 3\ndone", 1, True),
+        ("move 3; done; move 4", 1, True),
+        ("move 3\nopen 3", 2, False),
+        ('{"action": "move", "object_index": 3}', 1, False),
+        ('I go there: {"action": "move", "object_index": 3}', 1, False),
+        ('```json\n[{"action": "move", "object_index": 3}, {"action": "done"}]\n```', 1, True),
+        ('{"action": "done"}', 0, True),
+        ('{"plan": [{"action": "done"}]}', 0, True),
+        ("<think>done</think>move 3", 1, False),
+    ],
+)
+def test_answer_of_an_episode_has_calls_and_may_end_it(text, calls, done):
+    plan, ends = parse_answer(text)
+    assert (len(plan), ends) == (calls, done)
+
+
+@pytest.mark.parametrize("text", ["", "well done", "I am done with it", "{}", '{"action": 3}', "dance 3"])
+def test_answer_without_call_and_end_is_refused(text):
+    with pytest.raises(PlanError):
+        parse_answer(text)

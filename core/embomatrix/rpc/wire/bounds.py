@@ -140,6 +140,7 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "TurnObservation.room": _RESULT_TEXT,
     "TurnObservation.held": Bound(length=RESULT_TEXT, count=HELD_LEASES),
     "TurnObservation.changes": Bound(length=RESULT_TEXT, count=MAX_TABLE + 1),
+    "TurnObservation.sees": Bound(count=MAX_TABLE),
     "Reward.format": _REWARD,
     "Reward.relevance": _REWARD,
     "Reward.goal": _REWARD,

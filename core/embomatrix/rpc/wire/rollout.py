@@ -131,6 +131,7 @@ def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     message.seed = rollout.seed
     message.render = rollout.render
     message.also.extend(rollout.also)
+    message.sight = rollout.sight
     if rollout.prefix is not None:
         message.prefix.SetInParent()
         message.prefix.MergeFrom(_prefix_to_proto(rollout.prefix))
@@ -157,6 +158,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         render=message.render,
         also=tuple(message.also),
         prefix=_prefix_in(message),
+        sight=message.sight,
     )
     _check_prefix(rollout)
     object.__setattr__(rollout, "wire", wire)
@@ -181,12 +183,16 @@ def _check_prefix(rollout: Rollout) -> None:
     """Raise ConvertError for a prefix that is not a part of the plan."""
     prefix = rollout.prefix
     if prefix is None:
+        if rollout.sight:
+            raise ConvertError("sight", "found it without a prefix: expected a turn of an episode")
         return
-    if prefix.length >= len(rollout.plan):
-        raise ConvertError(
-            "prefix.length",
-            f"found {prefix.length} of {len(rollout.plan)} calls: expected fewer, since a turn has a new call",
+    if prefix.length + (not rollout.sight) > len(rollout.plan):
+        expected = (
+            "expected no more than the plan has"
+            if rollout.sight
+            else "expected fewer, since a turn without sight has a new call"
         )
+        raise ConvertError("prefix.length", f"found {prefix.length} of {len(rollout.plan)} calls: {expected}")
     if any(index >= after for index, after in itertools.pairwise((*prefix.failed, prefix.length))):
         raise ConvertError(
             "prefix.failed",

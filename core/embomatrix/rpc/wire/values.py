@@ -53,7 +53,9 @@ class _ReadWhenAsked:
 class Rollout(_ReadWhenAsked):
     """One plan to execute once. The plans of one task in one batch share ``group_id`` and ``seed``."""
 
-    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render", "also", "prefix"})
+    _left = frozenset(
+        {"rollout_id", "group_id", "task_id", "plan", "seed", "render", "also", "prefix", "sight"}
+    )
 
     rollout_id: str
     group_id: str
@@ -67,6 +69,8 @@ class Rollout(_ReadWhenAsked):
     """Ids of further rollouts of the group that are equal in everything else: one execution serves all."""
     prefix: EpisodePrefix | None = None
     """Calls of the plan that its episode has made before, if this is a turn of an episode."""
+    sight: bool = False
+    """The observation of this turn says what the robot sees. Such a turn may have no call after its prefix."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on unchanged; a modified copy has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)

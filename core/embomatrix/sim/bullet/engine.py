@@ -30,7 +30,7 @@ from embomatrix.sim.engine import (
 from embomatrix.sim.geometry.bounds import AssetBounds, bounds_of, forget
 from embomatrix.sim.geometry.spatial_hash import SpatialHash
 from embomatrix.sim.validation import check_again, check_fractions, check_pose, check_scene
-from embomatrix.world.geometry import IDENTITY, Aabb, Pose
+from embomatrix.world.geometry import IDENTITY, Aabb, Pose, Vec3
 from embomatrix.world.scene import Scene
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 BOX_SLACK_M: Final = 0.01
 """Boxes this far apart are still compared part by part: boxes of tilted cylinders may be slightly too small."""
+MOST_RAYS: Final = 16_384
+"""Rays that Bullet tests in one call."""
 SETTLE_RADIUS_M: Final = 0.02
 """Parts with boxes in this range take part in a settle; a stable object moves at most half as far."""
 
@@ -211,6 +213,34 @@ class BulletEngine:
         return tuple(
             names[number] for number in self._around.near(box) if not ignore or names[number] not in ignore
         )
+
+    def first_met(self, start_m: Vec3, ends_m: Sequence[Vec3]) -> tuple[str, ...]:
+        if not ends_m:
+            return ()
+        xs, ys, zs = zip(start_m, *ends_m, strict=True)
+        between = Aabb((min(xs), min(ys), min(zs)), (max(xs), max(ys), max(zs)))
+        # A body that was left behind may stand in the way where its object no longer is.
+        for number in {*self._around.near(between), *self._bodies.behind}:
+            if self._present[number]:
+                self._body(number)
+        for number, present in enumerate(self._present):
+            if not present:
+                self._bodies.put_away(number)
+        for static in self._statics_around.near(between):
+            self._bodies.static(self._bodies.first_of(static))
+        objects, statics = self._bodies.owners()
+        walls = len(self._scene.walls)
+
+        def name(body: int) -> str:
+            if body in objects:
+                return self._names[objects[body]]
+            return "" if body < 0 else WALL if statics[body] < walls else BACKGROUND
+
+        met: list[str] = []
+        for begin in range(0, len(ends_m), MOST_RAYS):
+            ends = ends_m[begin : begin + MOST_RAYS]
+            met += [name(hit[0]) for hit in self._bullet.rayTestBatch([start_m] * len(ends), ends)]
+        return tuple(met)
 
     def is_at_static(self, box: Aabb) -> bool:
         return bool(self._statics_around.near(box))

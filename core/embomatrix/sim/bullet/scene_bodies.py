@@ -5,12 +5,15 @@ depend on which bodies exist: they are never stepped, only compared in pairs.
 """
 
 from collections.abc import Iterator, Sequence
+from typing import Final
 
 from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
 from embomatrix.sim.bullet.client import BulletClient
 from embomatrix.world.asset import Asset
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import IDENTITY, Pose
 from embomatrix.world.scene import Scene
+
+_AWAY_M: Final = (0.0, 0.0, -1_000.0)
 
 
 class SceneBodies:
@@ -46,6 +49,25 @@ class SceneBodies:
     def leave_behind(self, number: int) -> None:
         """Mark an object as moved; its body follows on demand. Most moves are undone before a query."""
         self._behind.add(number)
+
+    def put_away(self, number: int) -> None:
+        """Move an object's body out of the scene until it is asked for again."""
+        body = self._objects.get(number)
+        if body is not None:
+            self._bullet.resetBasePositionAndOrientation(body, _AWAY_M, IDENTITY.quat_xyzw)
+            self._behind.add(number)
+
+    @property
+    def behind(self) -> tuple[int, ...]:
+        """Objects that have moved since their bodies followed."""
+        return tuple(self._behind)
+
+    def owners(self) -> tuple[dict[int, int], dict[int, int]]:
+        """Map bodies to the numbers of their objects, and bodies of static parts to the number of their first part."""
+        return (
+            {body: number for number, body in self._objects.items()},
+            {body: first for first, body in self._shared.items()},
+        )
 
     def missing(self) -> Iterator[int]:
         """Numbers of the objects without a body."""

@@ -3,11 +3,14 @@
 It needs no simulator: a result that fails it contradicts itself, whatever the scene. Audits check the rest.
 """
 
+import itertools
+
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.wire.values import Completed, Rollout
 from embomatrix.skills.syntax import Plan
 from embomatrix.skills.trace import Step
+from embomatrix.world.task import MAX_TABLE
 
 
 def contradiction(completed: Completed, rollout: Rollout, settings: RewardSettings) -> str:
@@ -20,9 +23,20 @@ def contradiction(completed: Completed, rollout: Rollout, settings: RewardSettin
             "it has an observation, and its rollout is no turn" if prefix is None else "it has no observation"
         )
     before, plan = _split(rollout)
-    return _wrong_steps(completed.steps, plan) or _wrong_reward(
+    return _wrong_sight(completed, rollout) or _wrong_steps(completed.steps, plan) or _wrong_reward(
         completed.reward, (*before, *(step.call for step in completed.steps if step.ok)), settings
     )
+
+
+def _wrong_sight(completed: Completed, rollout: Rollout) -> str:
+    observation = completed.observation
+    if observation is None:
+        return ""
+    if observation.looked != rollout.sight or (observation.sees and not observation.looked):
+        return "it says what the robot sees, and its turn is without sight"
+    if any(row >= after for row, after in itertools.pairwise((*observation.sees, MAX_TABLE))):
+        return "the rows that the robot sees are no rising indices of a table"
+    return ""
 
 
 def _split(rollout: Rollout) -> tuple[Plan, Plan]:

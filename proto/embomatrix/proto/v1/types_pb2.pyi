@@ -222,6 +222,7 @@ class Rollout(google.protobuf.message.Message):
     SEED_FIELD_NUMBER: builtins.int
     RENDER_FIELD_NUMBER: builtins.int
     PREFIX_FIELD_NUMBER: builtins.int
+    SIGHT_FIELD_NUMBER: builtins.int
     ALSO_FIELD_NUMBER: builtins.int
     rollout_id: builtins.str
     group_id: builtins.str
@@ -230,6 +231,8 @@ class Rollout(google.protobuf.message.Message):
     seed: builtins.int
     render: builtins.bool
     """Needs a slot that renders on a GPU."""
+    sight: builtins.bool
+    """The observation of this turn says what the robot sees. Such a turn may have no call after its prefix."""
     @property
     def plan(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SkillCall]: ...
     @property
@@ -251,10 +254,11 @@ class Rollout(google.protobuf.message.Message):
         seed: builtins.int = ...,
         render: builtins.bool = ...,
         prefix: Global___EpisodePrefix | None = ...,
+        sight: builtins.bool = ...,
         also: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["prefix", b"prefix"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["also", b"also", "bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "prefix", b"prefix", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "task_id", b"task_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["also", b"also", "bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "prefix", b"prefix", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "sight", b"sight", "task_id", b"task_id"]) -> None: ...
 
 Global___Rollout: typing_extensions.TypeAlias = Rollout
 
@@ -343,8 +347,12 @@ class TurnObservation(google.protobuf.message.Message):
     ROOM_FIELD_NUMBER: builtins.int
     HELD_FIELD_NUMBER: builtins.int
     CHANGES_FIELD_NUMBER: builtins.int
+    LOOKED_FIELD_NUMBER: builtins.int
+    SEES_FIELD_NUMBER: builtins.int
     room: builtins.str
     """Room of the robot; empty between rooms."""
+    looked: builtins.bool
+    """True for a turn with sight: `sees` is set."""
     @property
     def held(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
         """Object in the robot's hand, then its contents."""
@@ -353,14 +361,20 @@ class TurnObservation(google.protobuf.message.Message):
     def changes(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
         """New lines of the table's objects that differ from the state before the turn."""
 
+    @property
+    def sees(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
+        """Rows of the task's table that the robot sees, rising."""
+
     def __init__(
         self,
         *,
         room: builtins.str = ...,
         held: collections.abc.Iterable[builtins.str] | None = ...,
         changes: collections.abc.Iterable[builtins.str] | None = ...,
+        looked: builtins.bool = ...,
+        sees: collections.abc.Iterable[builtins.int] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["changes", b"changes", "held", b"held", "room", b"room"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["changes", b"changes", "held", b"held", "looked", b"looked", "room", b"room", "sees", b"sees"]) -> None: ...
 
 Global___TurnObservation: typing_extensions.TypeAlias = TurnObservation
 

@@ -130,10 +130,14 @@ class PhysicsScene:
     ) -> Completed:
         length = prefix.length
         if self._tree is not None:
-            run, judgement, shared = self._tree.execute_turn(task, turn.plan, turn.seed, length, on_step)
+            run, judgement, shared = self._tree.execute_turn(
+                task, turn.plan, turn.seed, length, on_step, sight=turn.sight
+            )
         else:
             shared = 0
-            run = self._simulator.execute_turn(task, turn.plan, turn.seed, length, on_step)
+            run = self._simulator.execute_turn(
+                task, turn.plan, turn.seed, length, on_step, sight=turn.sight
+            )
             judgement = judge(task, self._simulator.facts)
         prefix.check(run.steps[:length], run.prefix_digest)
         return Completed(

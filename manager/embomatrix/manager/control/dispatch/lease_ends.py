@@ -12,6 +12,7 @@ from embomatrix.manager.control.events import LeaseFinished
 from embomatrix.manager.control.plausibility import contradiction
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraCode, InfraFailure
+from embomatrix.skills.turns import TurnObservation
 
 
 def settle_result(state: DispatchState, event: LeaseFinished) -> None:
@@ -28,8 +29,9 @@ def settle_result(state: DispatchState, event: LeaseFinished) -> None:
         return
     match event.outcome:
         case Completed(observation=None) if lease.record.rollout.is_turn:
-            text = f"{event.worker_id} does not know turns of episodes: upgrade it"
-            _fail(state, lease, InfraFailure(InfraCode.VERSION_SKEW, text, event.worker_id))
+            _fail(state, lease, _outdated(event.worker_id, "turns of episodes"))
+        case Completed(observation=TurnObservation(looked=False)) if lease.record.rollout.sight:
+            _fail(state, lease, _outdated(event.worker_id, "sight in episodes"))
         case Completed() as completed:
             wrong = contradiction(completed, lease.record.rollout, lease.record.reward)
             if wrong:
@@ -39,6 +41,10 @@ def settle_result(state: DispatchState, event: LeaseFinished) -> None:
                 _complete(state, lease, completed)
         case InfraFailure() as failure:
             _fail(state, lease, dataclasses.replace(failure, worker_id=event.worker_id))
+
+
+def _outdated(worker_id: str, lacks: str) -> InfraFailure:
+    return InfraFailure(InfraCode.VERSION_SKEW, f"{worker_id} does not know {lacks}: upgrade it", worker_id)
 
 
 def give_back(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, counted: bool) -> None:

@@ -1,0 +1,16 @@
+"""Episodes in Python: ``make`` opens an environment over the tasks of a dataset."""
+
+from embomatrix.envs.environment import Environment, PlayedEpisode, make
+from embomatrix.envs.player import Observation
+from embomatrix.envs.rules import EpisodeEnd, EpisodeReward, EpisodeRules, Visibility
+
+__all__ = [
+    "Environment",
+    "EpisodeEnd",
+    "EpisodeReward",
+    "EpisodeRules",
+    "Observation",
+    "PlayedEpisode",
+    "Visibility",
+    "make",
+]

@@ -1,0 +1,243 @@
+"""The front door to episodes in Python: tasks of a dataset, played by answers in words, here or on a cluster.
+
+A thread of its own runs the event loop, so the calls can be used in scripts, notebooks and threads of a trainer alike.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
+
+import numpy as np
+
+from embomatrix.envs.player import EpisodePlayer, Observation
+from embomatrix.envs.rules import EpisodeRules, Visibility
+from embomatrix.envs.turns import LocalEpisodes
+from embomatrix.skills.prompt import Codec, Prompt, situation_of
+from embomatrix.starter.shipped import unpacked_tasks
+from embomatrix.world.dataset import SPLITS, Dataset, DatasetError
+
+if TYPE_CHECKING:
+    from embomatrix.reward.turns import RunningEpisode
+    from embomatrix.world.dataset import TaskRecord
+
+STARTER: Final = "starter"
+"""Name of the shipped dataset."""
+T = TypeVar("T")
+E = TypeVar("E", bound=StrEnum)
+
+
+class _Simulation(Protocol):
+    """Place where episodes are executed."""
+
+    async def open(self) -> None: ...
+
+    async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode: ...
+
+    async def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlayedEpisode:
+    """Episode of an environment. ``prompt`` opens it."""
+
+    task_id: str
+    prompt: Prompt
+    player: EpisodePlayer
+    """Its rules, knowledge, steps so far, reward and end."""
+
+
+class Environment:
+    """Context manager over episodes of a dataset's tasks, any number side by side. ``make`` opens one.
+
+    ``reset`` and ``step`` play one episode; ``begin`` and ``answer`` play many, whose turns are executed together.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str,
+        rules: EpisodeRules,
+        codec: Codec,
+        simulation: _Simulation,
+        seed: int,
+    ) -> None:
+        self.records = tuple(record for record in dataset.records if record.split == split)
+        """Tasks of the split, with their oracle plans."""
+        if not self.records:
+            raise DatasetError(
+                f"the dataset at {dataset.folder} has no task of the split {split!r}: expected one of {', '.join(SPLITS)} "
+                "with tasks"
+            )
+        self.rules = rules
+        self._dataset = dataset
+        self._codec = codec
+        self._simulation = simulation
+        self._draws = np.random.default_rng(seed)
+        self._current: PlayedEpisode | None = None
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="episodes", daemon=True)
+        self._thread.start()
+        try:
+            self._wait(simulation.open())
+        except BaseException:
+            self._end_loop()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def task_ids(self) -> tuple[str, ...]:
+        """Ids of the tasks of the split."""
+        return tuple(record.task.task_id for record in self.records)
+
+    def reset(self, task_id: str = "", seed: int | None = None) -> Prompt:
+        """Begin an episode for ``step`` and return its opening prompt.
+
+        Without a task and a seed, both are drawn. Raises DatasetError for an unknown task, and what executing a turn raises.
+        """
+        named = task_id or self.task_ids[int(self._draws.integers(len(self.records)))]
+        drawn = int(self._draws.integers(2**31)) if seed is None else seed
+        (self._current,) = self.begin([(named, drawn)])
+        return self._current.prompt
+
+    def step(self, text: str) -> Observation:
+        """Take the policy's answer in the episode that ``reset`` began. Raises RuntimeError without one, or after its end."""
+        (observation,) = self.answer([self._playing], [text])
+        return observation
+
+    @property
+    def _playing(self) -> PlayedEpisode:
+        if self._current is None:
+            raise RuntimeError("no episode was begun: call reset first")
+        return self._current
+
+    def begin(self, tasks: Sequence[tuple[str, int]]) -> tuple[PlayedEpisode, ...]:
+        """Begin an episode of each task, with its seed."""
+        records = [(self._dataset.find(task_id), seed) for task_id, seed in tasks]
+        return self._wait(_all([self._begin(record, seed) for record, seed in records]))
+
+    def answer(self, episodes: Sequence[PlayedEpisode], texts: Sequence[str]) -> tuple[Observation, ...]:
+        """Take one answer for each of the episodes, and execute them together."""
+        return self._wait(
+            _all([each.player.answer(text) for each, text in zip(episodes, texts, strict=True)])
+        )
+
+    def close(self) -> None:
+        """Free the simulators, or close the run on the cluster."""
+        if self._thread.is_alive():
+            try:
+                self._wait(self._simulation.close())
+            finally:
+                self._end_loop()
+
+    async def _begin(self, record: TaskRecord, seed: int) -> PlayedEpisode:
+        sight = self.rules.visibility is Visibility.SEEN
+        bundle = self._dataset.read_bundle(record.bundle_digest)
+        situation = situation_of(bundle.scene, record.task)
+        running = await self._simulation.begin(record, seed, sight=sight)
+        player = EpisodePlayer(running, situation, self.rules, self._codec)
+        return PlayedEpisode(record.task.task_id, await player.begin(), player)
+
+    def _wait(self, work: Coroutine[object, object, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    def _end_loop(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+def make(
+    dataset: str | Path = STARTER,
+    *,
+    split: str = "heldout",
+    visibility: str = Visibility.FULL,
+    rules: EpisodeRules | None = None,
+    codec: str = Codec.LINES,
+    manager: str = "",
+    token: str = "",
+    ca: bytes = b"",
+    seed: int = 0,
+) -> Environment:
+    """Open an environment over the tasks of a dataset: ``starter``, the shipped one, or a folder.
+
+    ``visibility`` is ``full`` or ``seen``; ``rules`` set all rules instead. ``codec`` is ``lines``, ``json`` or ``names``.
+    With the address of a ``manager``, turns are executed on its cluster, else in this process. ``seed`` draws tasks.
+
+    Raises ValueError for an unknown word, DatasetError for a missing dataset, ClusterError if the manager refuses.
+    """
+    known = rules or EpisodeRules(_member(Visibility, "visibility", visibility))
+    form = _member(Codec, "codec", codec)
+    loaded = Dataset.load(unpacked_tasks() if dataset == STARTER else dataset)
+    simulation = _Cluster(loaded, manager, token, ca) if manager else _InThisProcess(loaded)
+    return Environment(loaded, split, known, form, simulation, seed)
+
+
+def _member(kind: type[E], name: str, value: str) -> E:
+    try:
+        return kind(value)
+    except ValueError:
+        raise ValueError(f"{name} is {value!r}: expected one of {', '.join(kind)}") from None
+
+
+class _InThisProcess:
+    def __init__(self, dataset: Dataset) -> None:
+        self._episodes = LocalEpisodes(dataset.read_bundle)
+
+    async def open(self) -> None:
+        pass
+
+    async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
+        return self._episodes.begin(record.bundle_digest, record.task.task_id, seed, sight=sight)
+
+    async def close(self) -> None:
+        self._episodes.close()
+
+
+class _Cluster:
+    def __init__(self, dataset: Dataset, address: str, token: str, ca: bytes) -> None:
+        # gRPC takes a third of a second to import, and most environments need none.
+        from embomatrix.rpc.client import ClusterClient
+        from embomatrix.rpc.episodes import Episodes
+
+        self._dataset = dataset
+        self._connect: Callable[[], ClusterClient] = lambda: ClusterClient(address, token, ca=ca)
+        self._episodes: Callable[[ClusterClient, str], Episodes] = Episodes
+        self._stack = contextlib.AsyncExitStack()
+        self._sent: set[str] = set()
+
+    async def open(self) -> None:
+        self._client = await self._stack.enter_async_context(self._connect())
+        self._run_id = await self._client.open_run("episodes")
+        self._stack.push_async_callback(self._client.close_run, self._run_id)
+        self._running = await self._stack.enter_async_context(self._episodes(self._client, self._run_id))
+
+    async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
+        digest = record.bundle_digest
+        if digest not in self._sent:
+            await self._client.put_bundles({digest: self._dataset.bundle_bytes(digest)})
+            self._sent.add(digest)
+        return self._running.begin(digest, record.task.task_id, seed, sight=sight)
+
+    async def close(self) -> None:
+        await self._stack.aclose()
+
+
+async def _all(work: Sequence[Coroutine[object, object, T]]) -> tuple[T, ...]:
+    """Await all. An error of one is raised when all have ended."""
+    results = await asyncio.gather(*work, return_exceptions=True)
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
+    return tuple(result for result in results if not isinstance(result, BaseException))

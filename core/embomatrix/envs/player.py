@@ -1,0 +1,149 @@
+"""An episode played by answers in words: from the opening prompt to its end.
+
+The player reads a policy's answers, executes their calls turn by turn, on a cluster or in this process, and tells the policy
+what happened. It keeps the rules; the simulator knows nothing of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.envs.observer import Observer
+from embomatrix.envs.rules import EpisodeEnd, EpisodeReward, EpisodeRules, Visibility
+from embomatrix.reward.hierarchy import unparsable
+from embomatrix.reward.settings import PAPER, RewardSettings
+from embomatrix.skills.episode_text import not_an_action
+from embomatrix.skills.parse import PlanError, parse_answer
+from embomatrix.skills.prompt import Codec, with_indices
+
+if TYPE_CHECKING:
+    from embomatrix.reward.turns import RunningEpisode, Turn
+    from embomatrix.skills.prompt import Prompt, Situation
+    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.skills.trace import Step
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a policy is told after an answer. ``steps`` are the outcomes of the answer's calls."""
+
+    text: str
+    steps: tuple[Step, ...]
+    reward: EpisodeReward
+    end: EpisodeEnd | None
+    """Reason why the episode is over; None while it goes on."""
+
+
+class EpisodePlayer:
+    """One episode of a task under rules.
+
+    ``running`` executes the calls; it must have sight if the rules say ``seen``. ``situation`` is the task's at its start.
+    """
+
+    def __init__(
+        self,
+        running: RunningEpisode,
+        situation: Situation,
+        rules: EpisodeRules,
+        codec: Codec = Codec.LINES,
+        reward: RewardSettings = PAPER,
+    ) -> None:
+        self._running = running
+        self._situation = situation
+        self._rules = rules
+        self._codec = codec
+        self._seen = rules.visibility is Visibility.SEEN
+        if self._seen and not running.start.sight:
+            raise ValueError("the rules show only what the robot has seen: expected an episode with sight")
+        self.observer = Observer(situation, codec, rules.visibility)
+        self.steps: list[Step] = []
+        """Outcomes of all calls so far, refused ones included."""
+        self.end: EpisodeEnd | None = None
+        self.reward = EpisodeReward(unparsable(reward))
+        self._repeated: SkillCall | None = None
+        self._repeats = 0
+
+    async def begin(self) -> Prompt:
+        """Return the opening prompt. Raises what ``RunningEpisode.act`` raises."""
+        start = (await self._running.look()).observation if self._seen else None
+        return self.observer.begin(start)
+
+    async def answer(self, text: str) -> Observation:
+        """Take a policy's answer: one call, or ``done``. Text without a call counts as a failed call.
+
+        Raises RuntimeError after the end, and what ``RunningEpisode.act`` raises; then the episode is as before.
+        """
+        calls, done, notes = self._read(text)
+        return await self.act(calls, done=done, notes=notes)
+
+    async def act(
+        self, calls: Sequence[SkillCall], *, done: bool = False, notes: Sequence[str] = ()
+    ) -> Observation:
+        """Execute calls up to the first failure, as ``answer`` does with those of a text. ``done`` ends the episode."""
+        if self.end is not None:
+            raise RuntimeError(f"the episode is over ({self.end}): begin another")
+        most = min(self._rules.calls_per_answer, self._rules.calls - self.reward.calls)
+        if len(calls) > most:
+            notes = (*notes, f"Of {len(calls)} actions, the first {most} were carried out.")
+            done = False
+        steps, turn = await self._execute(calls[:most])
+        self.steps += steps
+        self._count(steps, turn, unread=not steps and not done)
+        observed = turn.observation if turn is not None else None
+        text = self.observer.tell(steps, observed, self.reward.calls, notes)
+        self.end = self._ending(done=done and all(step.ok for step in steps))
+        return Observation(text, tuple(steps), self.reward, self.end)
+
+    def stop(self, end: EpisodeEnd = EpisodeEnd.TOKENS) -> None:
+        """End the episode from outside."""
+        self.end = self.end or end
+
+    def _read(self, text: str) -> tuple[Plan, bool, list[str]]:
+        """Return the calls of an answer, whether it ends the episode, and notes about it."""
+        words = with_indices(text, self._situation) if self._codec is Codec.NAMES else text
+        try:
+            return *parse_answer(words, self._situation.profile), []
+        except PlanError as error:
+            return (), False, [not_an_action(error, self._codec)]
+
+    async def _execute(self, calls: Sequence[SkillCall]) -> tuple[list[Step], Turn | None]:
+        """Execute calls up to the first that fails, and refuse those with unknown rows without execution."""
+        allowed: list[SkillCall] = []
+        refused: Step | None = None
+        for call in calls:
+            refused = self.observer.refusal(call)
+            if refused is not None:
+                break
+            allowed.append(call)
+        turn = await self._running.act(allowed) if allowed else None
+        steps = [*turn.steps] if turn is not None else []
+        if refused is not None and len(steps) == len(allowed) and (not steps or steps[-1].ok):
+            steps.append(refused)
+        return steps, turn
+
+    def _count(self, steps: Sequence[Step], turn: Turn | None, *, unread: bool) -> None:
+        """Count the calls of an answer, or an answer that could not be read, and how often one failed in a row."""
+        for step in steps:
+            self._repeats = 0 if step.ok else 1 + (self._repeats if step.call == self._repeated else 0)
+            self._repeated = step.call
+        if unread:
+            self._repeats = 1 + (self._repeats if self._repeated is None else 0)
+            self._repeated = None
+        calls = self.reward.calls + len(steps) + unread
+        failures = self.reward.failures + sum(not step.ok for step in steps) + unread
+        cost = self._rules.call_cost * calls + self._rules.failure_cost * failures
+        tiers = turn.reward if turn is not None else self.reward.tiers
+        self.reward = EpisodeReward(tiers, calls, failures, cost)
+
+    def _ending(self, *, done: bool) -> EpisodeEnd | None:
+        if done:
+            return EpisodeEnd.DONE
+        if self._rules.ends_at_goal and self.reward.tiers.success:
+            return EpisodeEnd.GOAL
+        if self.reward.calls >= self._rules.calls:
+            return EpisodeEnd.CALLS
+        if 0 < self._rules.equal_failures <= self._repeats:
+            return EpisodeEnd.LOOP
+        return None
