@@ -11,41 +11,40 @@ import logging
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import numpy as np
 import typer
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from embomatrix.cli.evaluation_settings import Cluster, EvalSettings, Exam, world_exam
+from embomatrix.cli.evaluation_subjects import (
+    MAX_TOKENS,
+    Subject,
+    endpoint_subject,
+    playing_baseline,
+    policy_subject,
+    written_baseline,
+)
 from embomatrix.host.failure import INTERRUPTED, fail, unwritable
-from embomatrix.host.limits import usable_cores
 from embomatrix.host.own_files import is_own, prepare_output
 from embomatrix.host.printable import printable
 from embomatrix.rpc.options import Ca, Token, add_settings, given_options
-from embomatrix.skills.parse import plan_to_json
-from embomatrix.skills.prompt import Codec
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET, default_dataset
-from embomatrix.trainer.cluster.executor import Executor
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_toml, settings_error
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
 from embomatrix.trainer.evaluation.answer_sources import (
-    OnProgress,
-    ask_endpoint,
-    ask_policy,
     ask_script,
     questions_digest,
 )
 from embomatrix.trainer.evaluation.answers import (
     FILE,
     HEADER,
-    MOST_SAMPLES,
     Answer,
     AnswerSheet,
     EvaluationSetup,
@@ -53,76 +52,30 @@ from embomatrix.trainer.evaluation.answers import (
     ordered,
     read_answers,
 )
-from embomatrix.trainer.evaluation.baselines import PLANNERS, SCRIPTS, BaselineName, fitted_scripts
+from embomatrix.trainer.evaluation.baselines import SCRIPTS, BaselineName
 from embomatrix.trainer.evaluation.benchmark import Benchmark, find_benchmark
-from embomatrix.trainer.evaluation.exam import Question, WorldExam
+from embomatrix.trainer.evaluation.episodes import (
+    EpisodeExam,
+)
+from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import ScoreRow, read_row, report_of, text_report
 from embomatrix.trainer.policy.limits import (
-    ANSWER_TOKENS,
     Limits,
-    Ruler,
-    check_context,
     expressibility,
-    room_for,
     sentence_about,
 )
-from embomatrix.world.dataset import Dataset, DatasetError
-from embomatrix.world.task import MAX_TABLE, Profile
+from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    pass
 
 DEFAULT_OUT: Final = Path("runs/eval")
 REPORTS: Final = ("report.json", "report.txt", "report.html")
 REPORT_MARK: Final = b'"report": '
 """Part of the first bytes of each report.json."""
-MAX_TOKENS: Final = "max_tokens"
-"""Name of the setting that limits an answer."""
-Exam = WorldExam | NativeExam
 console = Console(highlight=False, markup=False, soft_wrap=True)
-
-
-class EvalSettings(BaseModel):
-    """Settings of an evaluation. Options of the command override those of the TOML file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
-    samples: int = Field(10, ge=1, le=MOST_SAMPLES)
-    """Plans per task."""
-    temperature: float = Field(1.0, ge=0)
-    """Sampling temperature. 0: greedy."""
-    seed: int = Field(0, ge=0)
-    """Seed of sampling and execution."""
-    tasks: int | None = Field(None, ge=1)
-    """Evaluate only the first tasks."""
-    max_tokens: int | None = Field(None, ge=1)
-    """Maximum tokens of an answer. Default: as the model was trained here, 1024 for all other models and endpoints."""
-    codec: Codec | None = None
-    """Plan format of a language model. Default: as it was trained here, else JSON."""
-    profile: Profile = Profile.HOUSEHOLD
-    """paper: tasks that need another household skill count as failed."""
-    concurrent: int = Field(8, ge=1)
-    """Concurrent requests to the endpoint."""
-    attempts: int = Field(6, ge=1)
-    """Attempts per request, with waits between."""
-    jobs: int | None = Field(None, ge=1)
-    """Simulator processes without a manager. Default: one per core."""
-    threads: int | None = Field(None, ge=1)
-    """torch threads."""
-    device: str = "cpu"
-    """torch device of a local model: cpu or cuda."""
-
-
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """Model, endpoint or baseline that is ready to answer, with its codec, maximum table rows and maximum tokens.
-
-    ``ruler`` measures prompts and plans for it, None for a baseline.
-    """
-
-    ask: Callable[[Sequence[Question], AnswerSheet, OnProgress], None]
-    codec: Codec = Codec.JSON
-    rows: int = MAX_TABLE
-    max_tokens: int = 1
-    ruler: Ruler | None = None
 
 
 def _option(panel: str, *names: str, **options: Any) -> Any:
@@ -201,27 +154,33 @@ def evaluate(
                 "expected one of --model, --endpoint, --baseline and --answers: give one of them"
             )
         settings = read_eval_settings(settings_file, given_options(context))
-        open_executor = functools.partial(_executor, manager, token, ca, settings.jobs)
+        cluster = Cluster(manager, token, ca, settings.jobs)
         if answers is not None:
-            _judge_stored(answers, bench, out, open_executor, beside or [])
+            _judge_stored(answers, bench, out, cluster, beside or [])
             return
         if bench == NATIVE and (split or settings.tasks):
             raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
         if training is not None and baseline not in SCRIPTS:
             raise TrainerError(f"--training is for the baselines {' and '.join(SCRIPTS)}: leave it out")
         label = model or model_name or str(baseline)
-        with _exam(
-            open_executor, bench or str(default_dataset()), split, settings.tasks, settings.profile
-        ) as exam:
+        if settings.interactive and (model or bench == NATIVE):
+            raise TrainerError(
+                "--interactive plays endpoints and baselines on our own tasks: serve a model with an OpenAI-compatible server "
+                "and pass --endpoint"
+            )
+        opened = functools.partial(world_exam, cluster, interactive=settings.interactive)
+        with _exam(opened, bench or str(default_dataset()), split, settings.tasks, settings.profile) as exam:
             folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
             _check_reports(folder)
             rows = [read_row(path, exam.digest) for path in beside or []]
-            if baseline is not None:
-                subject = Subject(functools.partial(ask_script, _baseline(exam, baseline, training)))
-            elif model:
-                subject = _policy(exam, model, settings)
+            if model:
+                subject = policy_subject(exam, model, settings)
+            elif baseline is None:
+                subject = endpoint_subject(exam, endpoint, model_name, key, settings, folder)
+            elif isinstance(exam, EpisodeExam):
+                subject = playing_baseline(exam, baseline, settings.seed)
             else:
-                subject = _endpoint(endpoint, model_name, key, settings, folder)
+                subject = Subject(functools.partial(ask_script, written_baseline(exam, baseline, training)))
             _prepare_reports(folder)
             setup, given = _ask(exam, subject, label, settings, folder)
             _judge(exam, setup, given, folder, rows)
@@ -263,23 +222,13 @@ def _report_errors() -> Iterator[None]:
         )
 
 
-def _executor(manager: str, token: str, ca: Path | None, jobs: int | None, bench: Benchmark) -> Executor:
-    """Executor on the manager's cluster, or in processes of this machine."""
-    if not manager:
-        from embomatrix.worker.slots.rollout_pool import RolloutPool
-
-        return RolloutPool(bench.folder, jobs or usable_cores())
-    from embomatrix.rpc.client import ClusterClient
-    from embomatrix.rpc.trust import read_ca, read_token
-    from embomatrix.trainer.cluster.executor import ClusterExecutor
-
-    connect = functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
-    return ClusterExecutor(connect, bench.dataset.bundle_bytes)
-
-
 @contextlib.contextmanager
 def _exam(
-    open_executor: Callable[[Benchmark], Executor], name: str, split: str, limit: int | None, profile: Profile
+    opened: Callable[[Benchmark], WorldExam | EpisodeExam],
+    name: str,
+    split: str,
+    limit: int | None,
+    profile: Profile,
 ) -> Iterator[Exam]:
     if name == NATIVE:
         from embomatrix.trainer.eai.environment import JudgeEnvironment
@@ -288,65 +237,7 @@ def _exam(
         with NativeJudge(JudgeEnvironment.find()) as judge:
             yield NativeExam(judge)
         return
-    bench = find_benchmark(name, split, limit, profile)
-    yield WorldExam(bench, open_executor(bench))
-
-
-def _policy(exam: Exam, model: str, settings: EvalSettings) -> Subject:
-    """Load the model. Raises TrainerError."""
-    from embomatrix.trainer.evaluation.models import load_model
-
-    policy, trained = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
-    if isinstance(exam, NativeExam) and policy.codec is Codec.NAMES:
-        raise TrainerError(
-            f"{model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
-        )
-    ask, ruler = functools.partial(ask_policy, policy), Ruler.of_policy(policy)
-    prompts = {each.task_id: each.prompt for each in exam.questions(policy.codec, trained.prompt.rows)}
-    max_tokens = settings.max_tokens or room_for(trained.grpo.max_new, prompts, ruler)
-    check_context(prompts, max_tokens, ruler, MAX_TOKENS)
-    return Subject(ask, policy.codec, trained.prompt.rows, max_tokens, ruler)
-
-
-def _endpoint(url: str, model_name: str, key: str, settings: EvalSettings, folder: Path) -> Subject:
-    if not model_name:
-        raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
-    if settings.codec is Codec.NAMES:
-        raise TrainerError("the codec `names` is for word-level policies: pass --codec json or lines")
-    from embomatrix.llm.endpoint import Endpoint, EndpointLimits
-
-    limits = EndpointLimits(attempts=settings.attempts, concurrent=settings.concurrent)
-    connect = functools.partial(Endpoint, url, model_name, api_key=key, limits=limits)
-    ask = functools.partial(ask_endpoint, connect, folder / "ledger.jsonl")
-    codec, max_tokens = settings.codec or Codec.JSON, settings.max_tokens or ANSWER_TOKENS
-    return Subject(ask, codec, max_tokens=max_tokens, ruler=Ruler.of_endpoint(codec))
-
-
-def _baseline(
-    exam: Exam, name: BaselineName, training: Path | None
-) -> Callable[[str, np.random.Generator], str]:
-    """Function that writes a baseline's answer: its plan in our world, the published human plan in EAI's."""
-    if isinstance(exam, NativeExam):
-        if name is not BaselineName.HUMAN:
-            raise TrainerError(
-                f"the baseline `{name}` is for our own tasks: on {NATIVE} pass --baseline human"
-            )
-        return lambda task_id, rng: exam.human(task_id)
-    if name is BaselineName.HUMAN:
-        raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
-    bench, tasks = exam.bench, exam.bench.tasks
-    if name in SCRIPTS:
-        scripts = fitted_scripts(name, bench.training if training is None else _training_tasks(training))
-        return lambda task_id, rng: json.dumps(plan_to_json(scripts.plan(task_id, tasks[task_id].situation)))
-    plan = PLANNERS[name]
-    return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
-
-
-def _training_tasks(folder: Path) -> Dataset:
-    try:
-        return Dataset.load(folder)
-    except DatasetError as error:
-        raise TrainerError(str(error)) from error
+    yield opened(find_benchmark(name, split, limit, profile))
 
 
 def _show_limits(exam: Exam, subject: Subject) -> None:
@@ -371,7 +262,7 @@ def _ask(
         split=exam.split,
         tasks=len(exam.task_ids),
         model=label,
-        codec=subject.codec.value if isinstance(exam, WorldExam) else EAI_CODEC,
+        codec=EAI_CODEC if isinstance(exam, NativeExam) else subject.codec.value,
         rows=subject.rows,
         samples=settings.samples,
         temperature=settings.temperature,
@@ -380,6 +271,7 @@ def _ask(
         questions=questions_digest(questions),
         by_rule=exam.by_rule,
         profile=settings.profile.value,
+        **_episodes_of(settings),
     )
     began_s = time.monotonic()
     with AnswerSheet(folder / FILE, setup) as sheet:
@@ -392,19 +284,25 @@ def _ask(
     return setup, given
 
 
-def _judge_stored(
-    path: Path,
-    bench: str,
-    out: Path | None,
-    open_executor: Callable[[Benchmark], Executor],
-    beside: Sequence[Path],
-) -> None:
+def _episodes_of(settings: EvalSettings) -> dict[str, Any]:
+    """Fields of a setup about episodes."""
+    if not settings.interactive:
+        return {}
+    return {
+        "visibility": settings.visibility.value,
+        "calls_factor": settings.calls_factor,
+        "calls_more": settings.calls_more,
+    }
+
+
+def _judge_stored(path: Path, bench: str, out: Path | None, cluster: Cluster, beside: Sequence[Path]) -> None:
     setup, stored = read_answers(path)
+    opened = functools.partial(world_exam, cluster, interactive=bool(setup.visibility))
     if setup.profile not in set(Profile):
         raise TrainerError(
             f"{path} names the unknown profile {setup.profile!r}: expected {' or '.join(Profile)}"
         )
-    with _exam(open_executor, bench or setup.bench, setup.split, setup.tasks, Profile(setup.profile)) as exam:
+    with _exam(opened, bench or setup.bench, setup.split, setup.tasks, Profile(setup.profile)) as exam:
         if exam.digest != setup.bench_digest:
             raise TrainerError(
                 f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "

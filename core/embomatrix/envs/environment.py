@@ -6,41 +6,29 @@ A thread of its own runs the event loop, so the calls can be used in scripts, no
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 import numpy as np
 
 from embomatrix.envs.player import EpisodePlayer, Observation
 from embomatrix.envs.rules import EpisodeRules, Visibility
-from embomatrix.envs.turns import LocalEpisodes
 from embomatrix.skills.prompt import Codec, Prompt, situation_of
 from embomatrix.starter.shipped import unpacked_tasks
 from embomatrix.world.dataset import SPLITS, Dataset, DatasetError
 
 if TYPE_CHECKING:
-    from embomatrix.reward.turns import RunningEpisode
+    from embomatrix.envs.simulation import Simulation
     from embomatrix.world.dataset import TaskRecord
 
 STARTER: Final = "starter"
 """Name of the shipped dataset."""
 T = TypeVar("T")
 E = TypeVar("E", bound=StrEnum)
-
-
-class _Simulation(Protocol):
-    """Place where episodes are executed."""
-
-    async def open(self) -> None: ...
-
-    async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode: ...
-
-    async def close(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +53,7 @@ class Environment:
         split: str,
         rules: EpisodeRules,
         codec: Codec,
-        simulation: _Simulation,
+        simulation: Simulation,
         seed: int,
     ) -> None:
         self.records = tuple(record for record in dataset.records if record.split == split)
@@ -180,8 +168,20 @@ def make(
     known = rules or EpisodeRules(_member(Visibility, "visibility", visibility))
     form = _member(Codec, "codec", codec)
     loaded = Dataset.load(unpacked_tasks() if dataset == STARTER else dataset)
-    simulation = _Cluster(loaded, manager, token, ca) if manager else _InThisProcess(loaded)
+    simulation = _simulation(loaded, manager, token, ca)
     return Environment(loaded, split, known, form, simulation, seed)
+
+
+def _simulation(dataset: Dataset, address: str, token: str, ca: bytes) -> Simulation:
+    """Import what the place needs and nothing else: trainers have no simulator, and most scripts no gRPC."""
+    if not address:
+        from embomatrix.envs.turns import LocalSimulation
+
+        return LocalSimulation(dataset)
+    from embomatrix.envs.simulation import ClusterSimulation
+    from embomatrix.rpc.client import ClusterClient
+
+    return ClusterSimulation(dataset, lambda: ClusterClient(address, token, ca=ca))
 
 
 def _member(kind: type[E], name: str, value: str) -> E:
@@ -189,49 +189,6 @@ def _member(kind: type[E], name: str, value: str) -> E:
         return kind(value)
     except ValueError:
         raise ValueError(f"{name} is {value!r}: expected one of {', '.join(kind)}") from None
-
-
-class _InThisProcess:
-    def __init__(self, dataset: Dataset) -> None:
-        self._episodes = LocalEpisodes(dataset.read_bundle)
-
-    async def open(self) -> None:
-        pass
-
-    async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
-        return self._episodes.begin(record.bundle_digest, record.task.task_id, seed, sight=sight)
-
-    async def close(self) -> None:
-        self._episodes.close()
-
-
-class _Cluster:
-    def __init__(self, dataset: Dataset, address: str, token: str, ca: bytes) -> None:
-        # gRPC takes a third of a second to import, and most environments need none.
-        from embomatrix.rpc.client import ClusterClient
-        from embomatrix.rpc.episodes import Episodes
-
-        self._dataset = dataset
-        self._connect: Callable[[], ClusterClient] = lambda: ClusterClient(address, token, ca=ca)
-        self._episodes: Callable[[ClusterClient, str], Episodes] = Episodes
-        self._stack = contextlib.AsyncExitStack()
-        self._sent: set[str] = set()
-
-    async def open(self) -> None:
-        self._client = await self._stack.enter_async_context(self._connect())
-        self._run_id = await self._client.open_run("episodes")
-        self._stack.push_async_callback(self._client.close_run, self._run_id)
-        self._running = await self._stack.enter_async_context(self._episodes(self._client, self._run_id))
-
-    async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
-        digest = record.bundle_digest
-        if digest not in self._sent:
-            await self._client.put_bundles({digest: self._dataset.bundle_bytes(digest)})
-            self._sent.add(digest)
-        return self._running.begin(digest, record.task.task_id, seed, sight=sight)
-
-    async def close(self) -> None:
-        await self._stack.aclose()
 
 
 async def _all(work: Sequence[Coroutine[object, object, T]]) -> tuple[T, ...]:

@@ -1,4 +1,4 @@
-"""What a policy knows within an episode: turns of the simulator become observations.
+"""Knowledge of a policy within an episode: turns of the simulator become observations.
 
 The observer follows the true state of every row, and tells of those rows that the rules let the policy know. It decides
 nothing by itself and draws nothing, so equal turns give equal observations.
@@ -54,7 +54,7 @@ class Observer:
 
     @property
     def situation(self) -> Situation:
-        """What the policy knows: a situation of the known rows as they were seen last, for a prompt from here on."""
+        """Knowledge of the policy as a situation: that of the known rows as they were seen last, for a prompt from here on."""
         rows = {index: seen.row for index, seen in self.memory.items()}
         known = replace(
             self._whole,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy is told after an answer. ``steps`` are the outcomes of the answer's calls."""
+    """Text that a policy is told after an answer, with its facts. ``steps`` are the outcomes of the answer's calls."""
 
     text: str
     steps: tuple[Step, ...]

@@ -11,7 +11,7 @@ EQUAL_FAILURES: Final = 4
 
 
 class Visibility(StrEnum):
-    """What observations tell of."""
+    """Part of the world that observations tell of."""
 
     FULL = "full"
     """All rows of the task's table, from the start."""

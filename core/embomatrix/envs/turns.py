@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan
     from embomatrix.skills.turns import EpisodePrefix
     from embomatrix.world.bundle import Bundle
+    from embomatrix.world.dataset import Dataset, TaskRecord
 
 SCENES_KEPT: Final = 4
 """Simulators kept, about 100 MB each."""
@@ -98,3 +99,21 @@ class LocalEpisodes:
             self._scenes[digest] = _Scene(bundle, simulator, tree)
         self._scenes.move_to_end(digest)
         return self._scenes[digest]
+
+
+class LocalSimulation:
+    """Simulators of this process."""
+
+    scenes = SCENES_KEPT
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._episodes = LocalEpisodes(dataset.read_bundle)
+
+    async def open(self) -> None:
+        pass
+
+    async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
+        return self._episodes.begin(record.bundle_digest, record.task.task_id, seed, sight=sight)
+
+    async def close(self) -> None:
+        self._episodes.close()

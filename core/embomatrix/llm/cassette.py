@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ class Cassette:
         self._model = model
         self._asked: Counter[str] = Counter()
         self._answers = _read(path) if path.exists() else {}
+        if model is not None and path.exists():
+            _drop_cut_line(path)
 
     async def complete(self, request: ChatRequest) -> Reply:
         """Return the recorded answer, or ask the model and record its answer."""
@@ -76,9 +79,18 @@ def digest(request: ChatRequest) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+def _drop_cut_line(path: Path) -> None:
+    """Drop a last line that a kill or a full disk has cut off: its question is asked again."""
+    data = path.read_bytes()
+    complete = data.rfind(b"\n") + 1
+    if complete < len(data):
+        os.truncate(path, complete)
+
+
 def _read(path: Path) -> dict[tuple[str, int], Reply]:
     answers = {}
-    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+    data = path.read_bytes()
+    for number, line in enumerate(data[: data.rfind(b"\n") + 1].splitlines(), start=1):
         try:
             value = parse_json(line)
             usage = Usage(int(value["prompt_tokens"]), int(value["completion_tokens"]))

@@ -1,4 +1,4 @@
-"""What the robot sees: objects that a straight line from its camera meets first.
+"""Sight of the robot: objects that a straight line from its camera meets first.
 
 The camera looks all around. Walls, furniture, closed doors and drawers hide what is behind or in them, and an object can be
 told from afar only if it is large.

@@ -1,4 +1,4 @@
-"""What the robot sees: walls, doors and furniture hide things, whatever bodies the engine has made before."""
+"""Sight of the robot: walls, doors and furniture hide things, whatever bodies the engine has made before."""
 
 import pytest
 from hypothesis import given, settings

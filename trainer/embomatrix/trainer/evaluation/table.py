@@ -165,8 +165,14 @@ def cause_tables(report: Mapping[str, Any]) -> tuple[ReportTable, ...]:
 def about(report: Mapping[str, Any]) -> str:
     """Benchmark and sampling of an evaluation in one line."""
     setup = report["setup"]
+    episodes = (
+        f", in episodes of at most {setup['calls_factor']:g} times the oracle's calls and {setup['calls_more']} "
+        f"(visibility {setup['visibility']})"
+        if setup.get("visibility")
+        else ""
+    )
     return (
-        f"{setup['bench']} ({setup['split']}): {report['tasks']} tasks, {setup['samples']} samples each, temperature "
+        f"{setup['bench']} ({setup['split']}): {report['tasks']} tasks, {setup['samples']} samples each{episodes}, temperature "
         f"{setup['temperature']:g}, {report['lost']} of {report['samples']} plans lost to the infrastructure"
     )
 

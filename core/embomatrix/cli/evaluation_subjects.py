@@ -1,0 +1,150 @@
+"""Subjects of `embomatrix eval`: a model in this process, an endpoint or a baseline, ready to answer.
+
+torch is imported only for a model in this process.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.scripts.searching import PlacePriors
+from embomatrix.skills.parse import plan_to_json
+from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.data.tasks import read_tasks
+from embomatrix.trainer.eai.exam import NAME as NATIVE
+from embomatrix.trainer.eai.exam import NativeExam
+from embomatrix.trainer.evaluation.answer_sources import (
+    OnProgress,
+    ask_endpoint,
+    ask_policy,
+    seed_of,
+)
+from embomatrix.trainer.evaluation.answers import AnswerSheet
+from embomatrix.trainer.evaluation.baselines import PLANNERS, SCRIPTS, BaselineName, fitted_scripts
+from embomatrix.trainer.evaluation.episodes import (
+    EpisodeExam,
+    EpisodeSubject,
+    PlanSubject,
+    SearchingSubject,
+    ask_endpoint_in_episodes,
+    play_episodes,
+)
+from embomatrix.trainer.evaluation.exam import Question, WorldExam
+from embomatrix.trainer.policy.limits import ANSWER_TOKENS, Ruler, check_context, room_for
+from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.task import MAX_TABLE
+
+if TYPE_CHECKING:
+    from embomatrix.cli.evaluation_settings import EvalSettings, Exam
+
+MAX_TOKENS: Final = "max_tokens"
+"""Name of the setting that limits an answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """Model, endpoint or baseline that is ready to answer, with its codec, maximum table rows and maximum tokens.
+
+    ``ruler`` measures prompts and plans for it, None for a baseline.
+    """
+
+    ask: Callable[[Sequence[Question], AnswerSheet, OnProgress], None]
+    codec: Codec = Codec.JSON
+    rows: int = MAX_TABLE
+    max_tokens: int = 1
+    ruler: Ruler | None = None
+
+
+def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
+    """Load the model. Raises TrainerError."""
+    from embomatrix.trainer.evaluation.models import load_model
+
+    policy, trained = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
+    if isinstance(exam, NativeExam) and policy.codec is Codec.NAMES:
+        raise TrainerError(
+            f"{model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
+        )
+    ask, ruler = functools.partial(ask_policy, policy), Ruler.of_policy(policy)
+    prompts = {each.task_id: each.prompt for each in exam.questions(policy.codec, trained.prompt.rows)}
+    max_tokens = settings.max_tokens or room_for(trained.grpo.max_new, prompts, ruler)
+    check_context(prompts, max_tokens, ruler, MAX_TOKENS)
+    return Subject(ask, policy.codec, trained.prompt.rows, max_tokens, ruler)
+
+
+def endpoint_subject(
+    exam: Exam, url: str, model_name: str, key: str, settings: EvalSettings, folder: Path
+) -> Subject:
+    if not model_name:
+        raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
+    if settings.codec is Codec.NAMES:
+        raise TrainerError("the codec `names` is for word-level policies: pass --codec json or lines")
+    from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+
+    limits = EndpointLimits(attempts=settings.attempts, concurrent=settings.concurrent)
+    connect = functools.partial(Endpoint, url, model_name, api_key=key, limits=limits)
+    if isinstance(exam, EpisodeExam):
+        ask = functools.partial(ask_endpoint_in_episodes, connect, folder, exam.stage)
+    else:
+        ask = functools.partial(ask_endpoint, connect, folder / "ledger.jsonl")
+    codec, max_tokens = settings.codec or Codec.JSON, settings.max_tokens or ANSWER_TOKENS
+    return Subject(ask, codec, max_tokens=max_tokens, ruler=Ruler.of_endpoint(codec))
+
+
+def playing_baseline(exam: EpisodeExam, baseline: BaselineName, seed: int) -> Subject:
+    """Baseline that plays episodes. Raises TrainerError for one that doesn't."""
+    if baseline in SCRIPTS:
+        raise TrainerError(
+            f"the baseline `{baseline}` writes whole plans: leave out --interactive, or pass the baseline oracle or greedy"
+        )
+    if baseline is BaselineName.HUMAN:
+        raise TrainerError(f"the human plans are of {NATIVE}: pass --baseline oracle")
+    tasks = exam.bench.tasks
+    if baseline is BaselineName.ORACLE:
+        training = read_tasks(Dataset(exam.bench.training.folder, exam.bench.training.train))
+        priors = PlacePriors(task.situation for task in training.values())
+
+        def subject_of(task_id: str, sample: int) -> EpisodeSubject:
+            return SearchingSubject(tasks[task_id], priors)
+    else:
+        plan = PLANNERS[baseline]
+
+        def subject_of(task_id: str, sample: int) -> EpisodeSubject:
+            rng = np.random.default_rng(seed_of(seed, task_id, sample))
+            return PlanSubject(plan(tasks[task_id], rng))
+
+    return Subject(functools.partial(play_episodes, exam.stage, subject_of), Codec.LINES)
+
+
+def written_baseline(
+    exam: WorldExam | NativeExam, name: BaselineName, training: Path | None
+) -> Callable[[str, np.random.Generator], str]:
+    """Function that writes a baseline's answer: its plan in our world, the published human plan in EAI's."""
+    if isinstance(exam, NativeExam):
+        if name is not BaselineName.HUMAN:
+            raise TrainerError(
+                f"the baseline `{name}` is for our own tasks: on {NATIVE} pass --baseline human"
+            )
+        return lambda task_id, rng: exam.human(task_id)
+    if name is BaselineName.HUMAN:
+        raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
+    bench, tasks = exam.bench, exam.bench.tasks
+    if name in SCRIPTS:
+        scripts = fitted_scripts(name, bench.training if training is None else _training_tasks(training))
+        return lambda task_id, rng: json.dumps(plan_to_json(scripts.plan(task_id, tasks[task_id].situation)))
+    plan = PLANNERS[name]
+    return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
+
+
+def _training_tasks(folder: Path) -> Dataset:
+    try:
+        return Dataset.load(folder)
+    except DatasetError as error:
+        raise TrainerError(str(error)) from error

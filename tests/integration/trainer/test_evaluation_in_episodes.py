@@ -1,0 +1,197 @@
+"""Evaluation in episodes: played call by call, kept at once, and judged again from the answers alone."""
+
+import functools
+import json
+from dataclasses import replace
+
+import pytest
+from tests.fakes.chat_server import ChatServer, completion
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.integration.cli.test_evaluate import run_evaluation
+
+from embomatrix.envs.turns import LocalSimulation
+from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.scripts.searching import PlacePriors
+from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup
+from embomatrix.trainer.evaluation.benchmark import find_benchmark
+from embomatrix.trainer.evaluation.episodes import (
+    EpisodeExam,
+    EpisodeStage,
+    SearchingSubject,
+    ask_endpoint_in_episodes,
+    play_episodes,
+)
+from embomatrix.trainer.evaluation.page import evaluation_page
+from embomatrix.trainer.evaluation.table import report_of, text_report
+from embomatrix.trainer.evaluation.taxonomy import Cause
+
+APPLE = "apple_to_counter"
+SOLVED = ("move 10", "pick_up 10", "move 0", "place 0 ontop", "done")
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    return find_benchmark(str(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen"))), "all")
+
+
+@pytest.fixture
+def apple(bench):
+    """Benchmark of one task."""
+    return replace(bench, records=tuple(record for record in bench.records if record.task.task_id == APPLE))
+
+
+def setup_of(bench, visibility="full", samples=1, calls_factor=2.0, calls_more=12):
+    return EvaluationSetup(
+        bench.name,
+        bench.digest,
+        bench.split,
+        len(bench.records),
+        "me",
+        "lines",
+        60,
+        samples,
+        1.0,
+        64,
+        0,
+        visibility=visibility,
+        calls_factor=calls_factor,
+        calls_more=calls_more,
+    )
+
+
+def exam_of(bench):
+    return EpisodeExam(bench, EpisodeStage(bench, functools.partial(LocalSimulation, bench.dataset)))
+
+
+def judged(bench, answers, setup):
+    result = exam_of(bench).judge(setup, answers, lambda *_: None)
+    value = report_of(setup, result)
+    return value, evaluation_page(value, result.pictures)
+
+
+class Talker(ChatServer):
+    """Model that says the next of its lines, however often it is asked, and fails after ``most`` answers."""
+
+    def __init__(self, lines, most=99):
+        super().__init__("")
+        self.lines = lines
+        self.most = most
+
+    def next_answer(self, request):
+        self.requests.append(request)
+        if len(self.requests) > self.most:
+            return (500, {}, "out of order", 0.0)
+        turn = sum(message["role"] == "assistant" for message in request["messages"])
+        return (200, {}, json.dumps(completion(self.lines[turn])), 0.0)
+
+
+def ask(server, exam, folder, setup):
+    limits = EndpointLimits(attempts=1, first_wait_s=0.01, concurrent=3)
+    path = folder / "answers.jsonl"
+    with server.serving() as url, AnswerSheet(path, setup) as sheet:
+        ask_endpoint_in_episodes(
+            lambda: Endpoint(url, "scripted", limits=limits),
+            folder,
+            exam.stage,
+            exam.questions(Codec.LINES, 60),
+            sheet,
+            lambda *_: None,
+        )
+        return sheet.ordered(exam.task_ids)
+
+
+def test_model_is_told_what_happened_after_each_answer(apple, tmp_path):
+    server, setup = Talker(SOLVED), setup_of(apple)
+    answers = ask(server, exam_of(apple), tmp_path, setup)
+    last = server.requests[-1]["messages"]
+    assert [message["role"] for message in last] == ["system", *["user", "assistant"] * 4, "user"]
+    assert "step by step" in last[0]["content"]
+    assert "Task: " in last[1]["content"]
+    assert last[-1]["content"].startswith("place 0 ontop: put apple 10 on top of countertop 0\n")
+    assert (len(server.requests), answers[0].completion_tokens) == (5, 10)
+    value, page = judged(apple, answers, setup)
+    assert value["overall"]["success"]["value"] == 1.0
+    assert "in episodes of at most 2 times the oracle's calls and 12 (visibility full)" in text_report(value)
+    assert (value, page) == judged(apple, answers, setup)
+
+
+def test_no_answer_is_bought_twice(apple, tmp_path):
+    failing, setup = Talker(SOLVED, most=2), setup_of(apple)
+    with pytest.raises(TrainerError, match=r"answered 500.*; 0 of 1 episodes are kept in .*the same command"):
+        ask(failing, exam_of(apple), tmp_path, setup)
+    with (tmp_path / "turns.jsonl").open("ab") as file:
+        file.write(b'{"question": "cut off')
+    again = Talker(SOLVED)
+    answers = ask(again, exam_of(apple), tmp_path, setup)
+    assert len(again.requests) == 3
+    assert judged(apple, answers, setup)[0]["overall"]["success"]["value"] == 1.0
+
+
+def test_searching_oracle_finds_what_it_does_not_see(bench, tmp_path):
+    setup, exam = setup_of(bench, "seen"), exam_of(bench)
+    priors = PlacePriors(task.situation for task in bench.tasks.values())
+    with AnswerSheet(tmp_path / "answers.jsonl", setup) as sheet:
+        play_episodes(
+            exam.stage,
+            lambda task_id, sample: SearchingSubject(bench.tasks[task_id], priors),
+            exam.questions(Codec.LINES, 60),
+            sheet,
+            lambda *_: None,
+        )
+        answers = sheet.ordered(exam.task_ids)
+    value, _ = judged(bench, answers, setup)
+    assert value["overall"]["success"]["value"] == 1.0
+    spoken = [text for answer in answers for text in json.loads(answer.text)]
+    assert any(text.startswith(("go_to_room", "open")) for text in spoken)
+
+
+@pytest.mark.parametrize(
+    ("texts", "cause", "reason"),
+    [
+        (["move 10", "done"], Cause.GOAL_NOT_MET, "done"),
+        (["pick_up 10"] * 4, Cause.MISSING_STEP, "out_of_reach"),
+        (["move 99", "done"], Cause.HALLUCINATED_OBJECT, "unknown_index"),
+        (["hm", "hm", "hm", "hm"], Cause.UNPARSABLE, "loop"),
+        (["move 10", "move 0"] * 20, Cause.GOAL_NOT_MET, "calls"),
+        ([], Cause.UNPARSABLE, "unfinished"),
+    ],
+)
+def test_end_of_an_episode_decides_its_cause(apple, texts, cause, reason):
+    setup = setup_of(apple)
+    value, _ = judged(apple, [Answer(APPLE, 0, json.dumps(texts))], setup)
+    [task] = value["verdicts"]
+    [sample] = task["samples"]
+    assert (sample["cause"], sample["reason"]) == (cause, reason)
+
+
+@pytest.mark.parametrize("text", ["move 10", "{}", "[1]"])
+def test_answers_of_plans_are_no_episodes(apple, text):
+    with pytest.raises(TrainerError, match="is no list of texts: expected the answers of an episode"):
+        judged(apple, [Answer(APPLE, 0, text)], setup_of(apple))
+
+
+def test_command_plays_episodes_and_judges_them_again(bench, tmp_path):
+    common = (f"--bench={bench.folder}", "--split=all", f"--out={tmp_path}", "--samples=1")
+    code, printed = run_evaluation("--baseline=oracle", "--interactive", "--visibility=seen", *common)
+    assert (code, "(visibility seen)" in printed) == (0, True)
+    before = (tmp_path / "report.json").read_bytes()
+    assert run_evaluation(f"--answers={tmp_path / 'answers.jsonl'}", f"--bench={bench.folder}")[0] == 0
+    assert (tmp_path / "report.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--model=runs/a",), "--interactive plays endpoints and baselines on our own tasks"),
+        (("--baseline=template",), "the baseline `template` writes whole plans: leave out --interactive"),
+        (("--baseline=human",), "the human plans are of eai-native: pass --baseline oracle"),
+        (("--baseline=oracle", "--visibility=half"), "Invalid value for '--visibility'"),
+    ],
+)
+def test_command_refuses_what_plays_no_episodes(bench, tmp_path, arguments, words):
+    code, printed = run_evaluation(
+        *arguments, "--interactive", f"--bench={bench.folder}", f"--out={tmp_path / 'out'}"
+    )
+    assert (code, words in printed) == (2, True), printed
