@@ -15,8 +15,10 @@ from rich.markup import escape as without_markup
 from rich.table import Table
 
 from embomatrix.cli.plan_text import plan_with_names, rows_for_names
-from embomatrix.cli.play_by_hand import play_by_hand
+from embomatrix.cli.play_by_hand import explore_by_hand, play_by_hand
+from embomatrix.envs.environment import make
 from embomatrix.envs.episode import Episode
+from embomatrix.envs.rules import EpisodeRules, Visibility
 from embomatrix.factory.commands.terminal import counter, fail, user_errors
 from embomatrix.host.own_files import prepare_output
 from embomatrix.host.printable import printable
@@ -89,6 +91,12 @@ def play(
     interactive: Annotated[
         bool, typer.Option("--interactive", help="Play by hand: type one call a line, and see what it does.")
     ] = False,
+    visibility: Annotated[
+        Visibility,
+        typer.Option(
+            help="With --interactive. full: the whole table of the task. seen: only what the robot has seen."
+        ),
+    ] = Visibility.FULL,
     dataset: DatasetOrShipped = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the execution.")] = 0,
     mode: Annotated[
@@ -110,10 +118,15 @@ def play(
             fail(
                 "expected one of --plan FILE, --oracle, --policy FOLDER, --interactive and --show: give one of them"
             )
+        if visibility is Visibility.SEEN and not interactive:
+            fail("--visibility seen is for --interactive: a plan is written before anything is seen")
         data = Dataset.load(dataset_folder(dataset))
         record = _record_of(data, task)
         bundle = data.bundle(record.bundle_digest)
         text = _text_of(plan) if plan else None
+        if visibility is Visibility.SEEN:
+            _explore_by_hand(data.folder, record, seed)
+            return
         _show_task(record.task)
         if show:
             _show_prompt(bundle, record.task)
@@ -162,23 +175,34 @@ def _plan_of_person(text: str, task: Task) -> Plan:
     return plan
 
 
+def _explore_by_hand(folder: Path, record: TaskRecord, seed: int) -> None:
+    """Play an episode that shows only what the robot has seen."""
+    rules = EpisodeRules(Visibility.SEEN)
+    with make(folder, split=record.split, rules=rules) as environment:
+        reward = explore_by_hand(environment, record.task.task_id, seed, _read_line, _show_lines)
+    if reward is not None:
+        _show_reward(reward.tiers)
+
+
+def _read_line() -> str | None:
+    try:
+        return console.input("> ")
+    except EOFError:
+        return None
+
+
+def _show_lines(text: str) -> None:
+    for line in text.splitlines():
+        console.print(escape(line))
+
+
 def _play_by_hand(bundle: Bundle, task: Task, seed: int) -> None:
     """Let a person play the task call by call, and print the reward at the end."""
-
-    def read() -> str | None:
-        try:
-            return console.input("> ")
-        except EOFError:
-            return None
-
-    def show(text: str) -> None:
-        for line in text.splitlines():
-            console.print(escape(line))
 
     with contextlib.closing(load_simulator(bundle)) as simulator:
         episode = Episode(simulator, task, situation_of(bundle.scene, task))
         episode.reset(seed)
-        reward, calls = play_by_hand(episode, read, show, seed)
+        reward, calls = play_by_hand(episode, _read_line, _show_lines, seed)
     if reward is not None:
         _show_reward(reward)
     if calls:

@@ -4,15 +4,23 @@ from collections.abc import Callable
 from typing import Final
 
 from embomatrix.cli.plan_text import plan_with_names
+from embomatrix.envs.environment import Environment
 from embomatrix.envs.episode import Episode
+from embomatrix.envs.rules import EpisodeReward
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.parse import PlanError, PlanReason
+from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.skills.syntax import MAX_STEPS, PROFILES, SIGNATURES, Plan, Skill, SkillCall
 from embomatrix.world.task import Task
 
 HELP: Final = (
     "One call a line, with a row or a name: `move 3`, `pick_up apple_1`, `place 0 inside`. `state` shows where everything is, "
     "`restart` begins again, `help` lists the calls, `quit` ends. A failed call changes nothing."
+)
+
+EXPLORING: Final = (
+    "One call a line, with the number after an object's name: `move 3`. You know what the robot has seen: `state` shows it. "
+    "`done` says that the task is fulfilled, `help` lists the calls, `quit` ends. A failed call changes nothing."
 )
 
 
@@ -55,6 +63,35 @@ def play_by_hand(
                 show(f"a plan has at most {MAX_STEPS} calls")
                 break
     return reward, tuple(done)
+
+
+def explore_by_hand(
+    environment: Environment,
+    task_id: str,
+    seed: int,
+    read: Callable[[], str | None],
+    show: Callable[[str], None],
+) -> EpisodeReward | None:
+    """Play an episode of the environment by the lines that ``read`` returns, None at the end of the input.
+
+    Return the reward of the state reached, None without any call.
+    """
+    (episode,) = environment.begin([(task_id, seed)])
+    show(episode.prompt.user)
+    show(EXPLORING)
+    player = episode.player
+    while (line := read()) is not None and (words := line.split()) != ["quit"]:
+        if words == ["help"]:
+            show("\n".join([EXPLORING, *map(signature, PROFILES[player.observer.situation.profile])]))
+        elif words == ["state"]:
+            show(prompt_for(player.observer.situation, Codec.LINES).user)
+        elif words:
+            (observation,) = environment.answer([episode], [line])
+            show(observation.text)
+            if observation.end is not None:
+                show(f"the episode is over: {observation.end}")
+                break
+    return player.reward if player.steps else None
 
 
 def signature(skill: Skill) -> str:

@@ -145,6 +145,31 @@ def test_typed_plan_may_name_objects_and_shows_the_lines_that_are_no_calls(run):
     assert (wrong.exit_code, "did you mean apple_1" in " ".join(wrong.output.split())) == (1, True)
 
 
+def test_person_explores_with_what_the_robot_has_seen(run):
+    typed = "state\nmove 14\nhelp\nmove 10\npick_up 10\nmove 0\nplace 0 ontop\ndone\n"
+    result = run("apple_to_counter", "--interactive", "--visibility", "seen", text=typed)
+    printed = " ".join(result.output.split())
+    assert result.exit_code == 0, result.output
+    assert "Rooms: kitchen_0, living_room_0" in printed
+    assert "place 0 ontop: put apple 10 on top of countertop 0" in printed
+    assert "the episode is over: done" in printed
+    assert "total │ success" in printed
+    assert (
+        "Reward" not in run("apple_to_counter", "--interactive", "--visibility", "seen", text="quit\n").output
+    )
+
+
+def test_nothing_is_seen_before_a_plan_is_written(run):
+    result = run("apple_to_counter", "--oracle", "--visibility", "seen")
+    assert (
+        result.exit_code,
+        "--visibility seen is for --interactive" in " ".join(result.output.split()),
+    ) == (
+        2,
+        True,
+    )
+
+
 def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
     result = run("apple_to_counter", "--show")
     assert result.exit_code == 0

@@ -56,7 +56,7 @@ class EvaluationSetup:
     by_rule: _Natural = 0
     profile: str = "household"
     visibility: Annotated[str, Field(pattern="^(|full|seen)$")] = ""
-    """Visibility of episodes; empty for plans. An episode has at most ``calls_factor`` times the oracle's calls and ``calls_more``."""
+    """Visibility of episodes; empty for plans. Budget: ``calls_factor`` times the oracle's calls and ``calls_more``."""
     calls_factor: Annotated[float, Field(ge=0, lt=math.inf)] = 0.0
     calls_more: _Natural = 0
 
