@@ -291,6 +291,12 @@ COMMANDS = (
         "name another folder with --out",
     ),
     CommandCase(
+        "searches over their own dataset",
+        "factory search --dataset=KITCHEN --out=KITCHEN",
+        "KITCHEN",
+        "name another folder with --out",
+    ),
+    CommandCase(
         "evaluation beside a foreign report",
         "eval --baseline=random --dataset=KITCHEN --out=FILES",
         "FILES/report.json",

@@ -44,6 +44,8 @@ REFUSALS = (
     Refusal("factory import --bddl one.bddl --scene Rs_int --bind-only --report OUT/r.json", "OUT/r.md"),
     Refusal("factory difficulty --dataset K --out OUT --easy-share 0.5", TASKS),
     Refusal("factory difficulty --dataset OUT --out OUT/../OUT --easy-share 0.5", TASKS),
+    Refusal("factory search --dataset K --out OUT", TASKS),
+    Refusal("factory search --dataset OUT --out OUT/../OUT", TASKS),
     Refusal("factory merge K K --out OUT", "OUT/notes.txt"),
     Refusal("factory corpus --out OUT", "OUT/tasks/notes.txt"),
     Refusal("factory corpus --part 1 --out OUT", "OUT/parts/1/tasks.jsonl"),

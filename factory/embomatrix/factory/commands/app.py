@@ -31,6 +31,7 @@ from embomatrix.factory.commands.language_model import (
 from embomatrix.factory.commands.layout import lay
 from embomatrix.factory.commands.merge import merge
 from embomatrix.factory.commands.options import ArmReachability, Jobs, Physical, Scenes, Seed, in_physics
+from embomatrix.factory.commands.search import search
 from embomatrix.factory.commands.starter import starter
 from embomatrix.factory.commands.task_import import import_
 from embomatrix.factory.commands.terminal import fail, say, show_table, user_errors
@@ -61,7 +62,7 @@ app.command("list", cls=DatasetCommand)(list_)
 app.command("try")(try_)
 for command in (agent, lay, inspect, corpus, starter, merge, evaluate):
     app.command()(command)
-for reader in (pictures, verify, audit, difficulty, prompts, export):
+for reader in (pictures, verify, audit, difficulty, search, prompts, export):
     app.command(cls=DatasetCommand)(reader)
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]

@@ -31,6 +31,7 @@ from embomatrix.factory.evaluate.scenes import (
     outcome_log,
 )
 from embomatrix.factory.evaluate.scripts import evaluate_scripts
+from embomatrix.factory.evaluate.search import evaluate_search
 from embomatrix.factory.evaluate.skills import evaluate_skills, needed_in_dataset
 from embomatrix.factory.evaluate.tasks import DraftFeatures, asked_of, evaluate_tasks, panel, people_of
 from embomatrix.factory.metrics.figures import (
@@ -60,14 +61,15 @@ def evaluate(
     parts: Annotated[
         list[str],
         typer.Argument(
-            help="Parts: tasks, scripts, skills, readings, rooms, scenes, looks, admission, lies, aesthetics; or a .json file."
+            help="Parts: tasks, scripts, search, skills, readings, rooms, scenes, looks, admission, lies, aesthetics; "
+            "or a .json file."
         ),
     ],
     dataset: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset for tasks, scripts, skills, readings and admission. Default for tasks: drafts of both writers; for "
-            "scripts, skills and readings: the shipped dataset."
+            help="Dataset for tasks, scripts, search, skills, readings and admission. Default for tasks: drafts of both "
+            "writers; for scripts, search, skills and readings: the shipped dataset."
         ),
     ] = None,
     training: Annotated[
@@ -121,7 +123,7 @@ def evaluate(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Measure parts of the factory: tasks, scripts, skills, answers of readers, rooms, layouts, admission, lies, aesthetics.
+    """Measure parts of the factory: tasks, scripts, searches, skills, answers of readers, rooms, layouts, admission and more.
 
     A language model judges looks, and also tasks if one is given.
     """
@@ -134,6 +136,7 @@ def evaluate(
         "scripts": lambda: evaluate_scripts(
             dataset or _shipped(scratch), training, jobs=jobs, counter=counter
         ),
+        "search": lambda: evaluate_search(dataset or _shipped(scratch), training, jobs=jobs, counter=counter),
         "rooms": lambda: _rooms(only, seed),
         "scenes": lambda: _scenes(_fixed(sample)[::only], only, seed, jobs, outcomes, writer),
         "looks": lambda: asyncio.run(_looks(judge(), _fixed(sample)[::only], seed, writer)),

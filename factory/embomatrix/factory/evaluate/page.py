@@ -31,6 +31,13 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "similar training instruction, *greedy* knows the goal. A small share means that the words need more than a table of "
         "phrases.",
     ),
+    "search": (
+        "Searches",
+        "`embomatrix factory evaluate search` plays an episode of each held-out task that shows only what the robot has seen. "
+        "A script knows what to do and with which objects, and looks for those that it has not seen, by how often training "
+        "tasks have them in a room or a piece of furniture. It has twice the calls of an oracle that sees everything, and 12 "
+        "more.",
+    ),
     "readings": (
         "Readers",
         "`embomatrix factory evaluate readings` judges answers of readers who saw prompts of held-out tasks only: the packaged "

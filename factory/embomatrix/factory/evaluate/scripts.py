@@ -60,7 +60,7 @@ def write_plans(dataset: Dataset, records: Sequence[TaskRecord], training: Datas
 def situations_of(dataset: Dataset, records: Sequence[TaskRecord]) -> dict[str, Situation]:
     """Return the content of the prompt of each record, by task id. Bundles are decoded one at a time."""
     found: dict[str, Situation] = {}
-    for digest, group in _by_bundle(records).items():
+    for digest, group in by_bundle(records).items():
         scene = dataset.read_bundle(digest).scene
         found |= {record.task.task_id: situation_of(scene, record.task) for record in group}
     return found
@@ -97,7 +97,7 @@ def run_scripts(
     work = partial(_run_bundle, dataset.folder)
     groups = [
         (digest, {record.task.task_id: plans[record.task.task_id] for record in group})
-        for digest, group in _by_bundle(records).items()
+        for digest, group in by_bundle(records).items()
     ]
     try:
         with process_pool(jobs) as pool:
@@ -124,7 +124,8 @@ def _run_bundle(folder: Path, group: tuple[str, ScriptPlans]) -> dict[str, Mappi
     return found
 
 
-def _by_bundle(records: Sequence[TaskRecord]) -> dict[str, list[TaskRecord]]:
+def by_bundle(records: Sequence[TaskRecord]) -> dict[str, list[TaskRecord]]:
+    """Group records by the digest of their bundle."""
     found: dict[str, list[TaskRecord]] = {}
     for record in records:
         found.setdefault(record.bundle_digest, []).append(record)

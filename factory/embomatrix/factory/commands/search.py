@@ -1,0 +1,63 @@
+"""``embomatrix factory search``: select the tasks of a dataset whose objects must be searched for."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from embomatrix.factory.commands.options import Jobs, processes
+from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
+from embomatrix.factory.evaluate.search import search_tasks, searches
+from embomatrix.host.own_files import Force
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
+from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, write_dataset
+from embomatrix.world.task import TaskCategory
+
+
+def search(
+    out: Annotated[Path, typer.Option(help="New folder for the selected tasks.")],
+    dataset: DatasetFolder = DEFAULT_DATASET,
+    training: Annotated[
+        Path | None,
+        typer.Option(
+            help="Dataset whose training tasks tell where things usually are. Default: the dataset itself."
+        ),
+    ] = None,
+    split: Annotated[str, typer.Option(help="Select from this split only, train or heldout.")] = "",
+    jobs: Jobs = None,
+    force: Force = False,
+) -> None:
+    """Select the tasks that are searches, as a dataset of their own.
+
+    A task is a search if its first look lacks an object that the oracle's plan handles. It is selected if a script that knows
+    what to do, but not where unseen objects are, solves it with twice the oracle's calls and 12 more.
+    """
+    if split and split not in SPLITS:
+        fail(f"unknown split {split!r}: expected {' or '.join(SPLITS)}")
+    if out.resolve() == dataset.resolve():
+        fail(
+            f"a selection in {out} would replace the tasks that it is made of: name another folder with --out"
+        )
+    if not force and (out / TASKS_FILE).exists():
+        fail(f"{out} holds a dataset already: name another folder with --out, or pass --force to replace it")
+    with user_errors(out):
+        found = Dataset.load(dataset)
+        records = [record for record in found.records if split in ("", record.split)]
+        learned = found if training is None else Dataset.load(training)
+        with counter("tasks", len(records)) as count:
+            results = search_tasks(found, records, learned, jobs=processes(jobs), progress=count)
+        chosen = searches(records, results)
+        digests = dict.fromkeys(record.bundle_digest for record in chosen)
+        write_dataset(out, chosen, {digest: found.bundle_bytes(digest) for digest in digests})
+    hidden = sum(result.is_search for result in results.values())
+    say(
+        f"{hidden} of {len(records)} tasks hide something from the first look; {len(chosen)} are solved: {out}"
+    )
+    counts = {
+        kind: Counter(record.task.category for record in chosen if record.split == kind) for kind in SPLITS
+    }
+    show_table(
+        ("category", "train", "held out"),
+        [(category.words, *(counted[category] for counted in counts.values())) for category in TaskCategory],
+    )

@@ -1,0 +1,164 @@
+"""Tasks as searches: what a robot sees of them at the start, and whether a script finds the rest.
+
+The searching script knows what to do and with which objects, but not where those are that the robot has not seen. A task is a
+search if the first look lacks an object that its oracle plan handles: then no plan that is written at the start can name it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from embomatrix.envs.player import EpisodePlayer
+from embomatrix.envs.rules import EpisodeRules, Visibility
+from embomatrix.envs.turns import LocalEpisodes
+from embomatrix.factory.admission import oracle_plan
+from embomatrix.factory.evaluate.scripts import by_bundle, situations_of
+from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
+from embomatrix.pages.figures import Better, Figure, wilson
+from embomatrix.scripts.searching import PlacePriors, SearchingScript
+from embomatrix.sim.process_pool import process_pool
+from embomatrix.skills.prompt import Codec, situation_of
+from embomatrix.skills.syntax import MAX_STEPS
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+
+CALLS_FACTOR: Final = 2
+CALLS_MORE: Final = 12
+"""Budget of a search: so many times the calls of an oracle that sees everything, and so many more."""
+BLIND_GOAL: Final = 0.35
+SEARCH_GOAL: Final = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class SearchResult:
+    """Search for the objects of one task."""
+
+    hidden: int
+    """Objects of the oracle plan that the first look lacks."""
+    found: bool
+    """The script reached the goal within the budget."""
+    calls: int
+    """Calls of the script, failed ones included."""
+
+    @property
+    def is_search(self) -> bool:
+        return self.hidden > 0
+
+
+SearchResults = Mapping[str, SearchResult]
+"""Results by task id."""
+
+
+def search_tasks(
+    dataset: Dataset,
+    records: Sequence[TaskRecord],
+    training: Dataset,
+    *,
+    jobs: int,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> SearchResults:
+    """Play an episode of each task with the searching script, which learns from ``training`` where things usually are.
+
+    Calls ``progress`` with the number of finished tasks. Raises DatasetError if a bundle can't be read or a process dies.
+    """
+    priors = PlacePriors(situations_of(training, training.train).values())
+    found: dict[str, SearchResult] = {}
+    try:
+        with process_pool(jobs) as pool:
+            for results in pool.map(
+                partial(_search_bundle, dataset.folder, priors), by_bundle(records).values()
+            ):
+                found |= results
+                progress(len(found))
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            "a process that searches died, perhaps out of memory: run the command again with fewer --jobs"
+        ) from error
+    return found
+
+
+def _search_bundle(
+    folder: Path, priors: PlacePriors, records: Sequence[TaskRecord]
+) -> dict[str, SearchResult]:
+    with LocalEpisodes(Dataset(folder, ()).read_bundle) as episodes:
+        return {
+            record.task.task_id: asyncio.run(_search(folder, episodes, record, priors)) for record in records
+        }
+
+
+async def _search(
+    folder: Path, episodes: LocalEpisodes, record: TaskRecord, priors: PlacePriors
+) -> SearchResult:
+    scene = Dataset(folder, ()).read_bundle(record.bundle_digest).scene
+    situation, plan = situation_of(scene, record.task), oracle_plan(record)
+    used = {index for call in plan for index in (call.object_index, call.source_index)}
+    script = SearchingScript(
+        plan, {row.index: row.category for row in situation.rows if row.index in used}, priors
+    )
+    budget = min(MAX_STEPS, CALLS_FACTOR * len(plan) + CALLS_MORE)
+    rules = EpisodeRules(Visibility.SEEN, calls=budget)
+    running = episodes.begin(record.bundle_digest, record.task.task_id, sight=True)
+    player = EpisodePlayer(running, situation, rules, Codec.LINES)
+    await player.begin()
+    hidden = used - player.observer.memory.keys() - {None}
+    while player.end is None:
+        last = player.steps[-1] if player.steps else None
+        call = script.next_call(player.observer.situation, last)
+        await player.act(() if call is None else (call,), done=call is None)
+    return SearchResult(len(hidden), player.reward.tiers.success, player.reward.calls)
+
+
+def searches(records: Sequence[TaskRecord], results: SearchResults) -> list[TaskRecord]:
+    """Return the tasks that are searches and that the script solves."""
+    return [
+        record
+        for record in records
+        if (result := results.get(record.task.task_id)) is not None and result.is_search and result.found
+    ]
+
+
+def evaluation_of(results: SearchResults, conditions: Mapping[str, str | int]) -> EvaluationFigures:
+    """Return the success of the searching script, and the share of tasks that need no search."""
+    held = list(results.values())
+    hidden = [result for result in held if result.is_search]
+    oracle = sum(result.found for result in held) / len(held)
+    blind = 1 - len(hidden) / len(held)
+    spread = wilson(oracle, len(held))
+    note = (
+        f"`search_oracle_success` {oracle:.3f} [{spread.low:.3f}, {spread.high:.3f}], a Wilson interval over tasks. "
+        f"`search_blind_success` is the share of tasks whose first look has all objects of the oracle plan. The script takes "
+        f"{sum(result.calls for result in held) / len(held):.1f} calls on average."
+    )
+    figures = (
+        Figure("search_blind_success", blind, "", Better.LOWER, len(held), BLIND_GOAL),
+        Figure("search_oracle_success", oracle, "", Better.HIGHER, len(held), SEARCH_GOAL),
+    )
+    return EvaluationFigures("search", conditions, figures, (note,))
+
+
+def evaluate_search(
+    folder: Path,
+    training: Path | None,
+    *,
+    jobs: int,
+    counter: Callable[[str, int], contextlib.AbstractContextManager[Callable[[int], None]]],
+) -> EvaluationFigures:
+    """Measure searches on the held-out split of a dataset. Raises EvaluationError for one without held-out tasks."""
+    dataset = Dataset.load(folder)
+    learned = dataset if training is None else Dataset.load(training)
+    if not dataset.heldout:
+        raise EvaluationError(f"{folder} has no held-out tasks: build it with --heldout")
+    with counter("tasks", len(dataset.heldout)) as count:
+        results = search_tasks(dataset, dataset.heldout, learned, jobs=jobs, progress=count)
+    conditions: dict[str, str | int] = {
+        "dataset": dataset.folder.name,
+        "training tasks": len(learned.train),
+        "held-out tasks": len(dataset.heldout),
+    }
+    return evaluation_of(results, conditions)

@@ -1,0 +1,124 @@
+"""Searches: tasks whose first look lacks something, found by a script that knows only what the robot has seen."""
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from typer.testing import CliRunner
+
+from embomatrix.factory.commands.app import app
+from embomatrix.factory.evaluate.search import evaluate_search, search_tasks, searches
+from embomatrix.scripts.searching import PlacePriors, SearchingScript, room_kind
+from embomatrix.skills.prompt import PromptRow, Situation
+from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.trace import Step
+from embomatrix.world.dataset import Dataset
+from embomatrix.world.state import Relation
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory):
+    return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen")))
+
+
+@pytest.fixture(scope="module")
+def results(kitchen):
+    return search_tasks(kitchen, kitchen.records, kitchen, jobs=1)
+
+
+def test_searches_hide_something_and_are_solved(kitchen, results):
+    assert results.keys() == {record.task.task_id for record in kitchen.records}
+    assert not results["apple_to_counter"].is_search
+    assert all(result.found for result in results.values())
+    chosen = searches(kitchen.records, results)
+    assert 0 < len(chosen) < len(kitchen.records)
+
+
+def test_command_writes_the_searches(kitchen, results, tmp_path):
+    out = tmp_path / "selected"
+    done = CliRunner().invoke(app, ["search", f"--dataset={kitchen.folder}", f"--out={out}", "--jobs=1"])
+    assert done.exit_code == 0, done.output
+    assert Dataset.load(out).records == tuple(searches(kitchen.records, results))
+
+
+def test_figures_are_of_the_held_out_tasks(kitchen):
+    found = evaluate_search(kitchen.folder, None, jobs=1, counter=lambda name, total: _Counter())
+    oracle, blind = found.figure("search_oracle_success"), found.figure("search_blind_success")
+    assert (oracle.value, oracle.n) == (1.0, len(kitchen.heldout))
+    assert 0 <= blind.value <= 1
+
+
+class _Counter:
+    def __enter__(self):
+        return lambda done: None
+
+    def __exit__(self, *_):
+        pass
+
+
+FRIDGE = PromptRow(0, "fridge_1", "fridge", "kitchen_0", states=("closed",), fixed=True)
+CABINET = PromptRow(1, "cabinet_1", "cabinet", "kitchen_0", states=("closed",), fixed=True)
+MILK = PromptRow(2, "milk_1", "milk", "kitchen_0", "fridge_1", Relation.INSIDE)
+PLAN = (SkillCall(Skill.OPEN, object_index=0), SkillCall(Skill.PICK_UP, object_index=2))
+
+
+def situation(*rows, room="kitchen_0", home=("kitchen_0",)):
+    return Situation(home, room, rows, "Drink the milk.", 3, home=home)
+
+
+def script(*known):
+    return SearchingScript(PLAN, {0: "fridge", 2: "milk"}, PlacePriors(known))
+
+
+def call(skill, index):
+    return SkillCall(skill, object_index=index)
+
+
+def done(which):
+    return Step(which, None, "done")
+
+
+def test_script_opens_first_what_usually_holds_the_thing():
+    learned = script(situation(FRIDGE, CABINET, MILK))
+    assert learned.next_call(situation(FRIDGE, CABINET), None) == call(Skill.MOVE, 0)
+    assert learned.next_call(situation(FRIDGE, CABINET), done(call(Skill.MOVE, 0))) == call(Skill.OPEN, 0)
+
+
+def test_script_closes_what_it_opened_in_vain_and_looks_elsewhere():
+    learned = script(situation(FRIDGE, CABINET, MILK))
+    empty = PromptRow(0, "fridge_1", "fridge", "kitchen_0", states=("open",), fixed=True)
+    for _ in range(2):
+        learned.next_call(situation(FRIDGE, CABINET), None)
+    assert learned.next_call(situation(empty, CABINET), done(call(Skill.OPEN, 0))) == call(Skill.CLOSE, 0)
+    assert learned.next_call(situation(FRIDGE, CABINET), done(call(Skill.CLOSE, 0))) == call(Skill.MOVE, 1)
+
+
+def test_script_leaves_out_what_is_done_already():
+    learned = script(situation(FRIDGE, CABINET, MILK))
+    opened = PromptRow(0, "fridge_1", "fridge", "kitchen_0", states=("open",), fixed=True)
+    assert learned.next_call(situation(opened, CABINET, MILK), None) == call(Skill.PICK_UP, 2)
+    assert learned.next_call(situation(opened, CABINET, MILK), done(call(Skill.PICK_UP, 2))) is None
+
+
+def test_script_goes_to_the_room_that_usually_has_the_thing():
+    home = ("bedroom_0", "hall_0", "kitchen_0")
+    learned = script(situation(FRIDGE, MILK))
+    at_start = situation(FRIDGE, room="hall_0", home=home)
+    seen = PromptRow(0, "fridge_1", "fridge", "kitchen_0", states=("open",), fixed=True)
+    assert learned.next_call(at_start, None) == SkillCall(Skill.GO_TO_ROOM, room_name="kitchen_0")
+    assert learned.next_call(situation(seen, room="kitchen_0", home=home), None) == SkillCall(
+        Skill.GO_TO_ROOM, room_name="bedroom_0"
+    )
+
+
+def test_script_moves_and_repeats_a_call_that_failed_once():
+    learned = script()
+    everything = situation(FRIDGE, CABINET, MILK)
+    assert learned.next_call(everything, None) == call(Skill.OPEN, 0)
+    failed = Step(call(Skill.OPEN, 0), "out_of_reach", "too far")
+    assert learned.next_call(everything, failed) == call(Skill.MOVE, 0)
+    assert learned.next_call(everything, done(call(Skill.MOVE, 0))) == call(Skill.OPEN, 0)
+
+
+def test_script_gives_up_when_nowhere_is_left():
+    learned = script()
+    assert learned.next_call(situation(), None) is None
+    assert room_kind("living_room_0") == "living_room"
