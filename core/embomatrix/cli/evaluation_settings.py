@@ -61,7 +61,7 @@ class EvalSettings(BaseModel):
     interactive: bool = False
     """Play episodes: one call an answer, each after the observation of the last (docs/episodes.md)."""
     visibility: Visibility = Visibility.FULL
-    """What episodes show. full: the whole table of the task. seen: what the robot has seen."""
+    """Part of the task that episodes show. full: the whole table of the task. seen: what the robot has seen."""
     calls_factor: float = Field(2.0, ge=0, le=64)
     """Budget of calls of an episode, as a multiple of the oracle's."""
     calls_more: int = Field(12, ge=0, le=MAX_STEPS)
@@ -70,7 +70,7 @@ class EvalSettings(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """Where plans and episodes are executed: a manager's cluster, or this machine without an address."""
+    """Place where plans and episodes are executed: a manager's cluster, or this machine without an address."""
 
     manager: str
     token: str

@@ -34,7 +34,7 @@ _UNDONE: Final[Mapping[Skill, str]] = {
 
 
 class PlacePriors:
-    """How often objects of a category are in a kind of room, and on or in a category of furniture."""
+    """Frequency of a category's objects in kinds of rooms, and on or in categories of furniture."""
 
     def __init__(self, situations: Iterable[Situation] = ()) -> None:
         """Count the rows of these situations."""
