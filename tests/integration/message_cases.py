@@ -291,6 +291,18 @@ COMMANDS = (
         "name another folder with --out",
     ),
     CommandCase(
+        "conversations in another format",
+        "factory conversations --dataset=KITCHEN --out=FILES/talks.xlsx",
+        "the suffix of FILES/talks.xlsx is '.xlsx'",
+        "expected .jsonl or .parquet",
+    ),
+    CommandCase(
+        "conversations of a word-level policy",
+        "factory conversations --dataset=KITCHEN --codec=names --out=FILES/talks.jsonl",
+        "the codec `names` is for word-level policies",
+        "expected lines or json",
+    ),
+    CommandCase(
         "searches over their own dataset",
         "factory search --dataset=KITCHEN --out=KITCHEN",
         "KITCHEN",

@@ -25,7 +25,7 @@ READERS = {
     *("demo", "train", "imitate", "play", "manager serve", "bench sample", "bench workload"),
     *("experiment learning", "experiment times", "experiment compare"),
     *("factory list", "factory inspect", "factory pictures", "factory verify", "factory audit"),
-    *("factory difficulty", "factory search", "factory prompts", "factory export"),
+    *("factory difficulty", "factory search", "factory conversations", "factory prompts", "factory export"),
 }
 
 

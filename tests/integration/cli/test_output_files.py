@@ -53,6 +53,7 @@ WRITERS = (
     "factory audit --dataset K --json OUT",
     "factory prompts --dataset K --out OUT",
     "factory export --dataset K --out OUT.jsonl",
+    "factory conversations --dataset K --split heldout --out OUT.jsonl",
     "factory assets draw --category apple --out OUT",
     f"play {TASK} --dataset K --oracle --film OUT.gif",
     "scene build Rs_int --report OUT",
@@ -72,6 +73,7 @@ QUICK = (
     "factory evaluate lies --page OUT",
     "factory prompts --dataset K --out OUT",
     "factory export --dataset K --out OUT.jsonl",
+    "factory conversations --dataset K --split heldout --out OUT.jsonl",
     "factory assets draw --category apple --out OUT",
     "scene import house.json --out OUT",
 )

@@ -54,6 +54,7 @@ REFUSALS = (
     Refusal("factory corpus --part 2 --freeze OUT/frozen.json", "OUT/frozen.json"),
     Refusal(f"factory inspect {TASK} --dataset K", f"{TASK}.html"),
     Refusal("factory export --dataset K --out OUT/t.jsonl", "OUT/README.md"),
+    Refusal("factory conversations --dataset K --out OUT/t.jsonl", "OUT/t.jsonl"),
     Refusal("factory evaluate lies --out OUT", "OUT/lies.json"),
     Refusal("factory lay --scene Rs_int --bddl one.bddl --method random --out OUT", "OUT/plan.png"),
     Refusal("factory assets draw --category apple", "assets.png"),

@@ -11,6 +11,7 @@ import typer
 from embomatrix.factory.commands.agents import agent
 from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.build import make_dataset
+from embomatrix.factory.commands.conversations import conversations_
 from embomatrix.factory.commands.corpus import corpus
 from embomatrix.factory.commands.datasets import export, list_, prompts
 from embomatrix.factory.commands.difficulty import difficulty
@@ -60,6 +61,7 @@ app.add_typer(assets_app, name="assets")
 app.command("import")(import_)
 app.command("list", cls=DatasetCommand)(list_)
 app.command("try")(try_)
+app.command("conversations", cls=DatasetCommand)(conversations_)
 for command in (agent, lay, inspect, corpus, starter, merge, evaluate):
     app.command()(command)
 for reader in (pictures, verify, audit, difficulty, search, prompts, export):

@@ -24,9 +24,10 @@ from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigure
 from embomatrix.pages.figures import Better, Figure, wilson
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
 from embomatrix.sim.process_pool import process_pool
-from embomatrix.skills.prompt import Codec, situation_of
-from embomatrix.skills.syntax import MAX_STEPS
+from embomatrix.skills.prompt import Codec, Prompt, situation_of
+from embomatrix.skills.syntax import MAX_STEPS, SkillCall
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.scene import Scene
 
 CALLS_FACTOR: Final = 2
 CALLS_MORE: Final = 12
@@ -96,22 +97,51 @@ async def _search(
     folder: Path, episodes: LocalEpisodes, record: TaskRecord, priors: PlacePriors
 ) -> SearchResult:
     scene = Dataset(folder, ()).read_bundle(record.bundle_digest).scene
+    played = await play_search(episodes, scene, record, priors)
+    return SearchResult(played.hidden, played.player.reward.tiers.success, played.player.reward.calls)
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedSearch:
+    """Episode of the searching script: its texts, the player at its end, and the objects that the first look lacked.
+
+    ``told`` are the observations, the task first; ``calls`` answer them, None for the end.
+    """
+
+    prompt: Prompt
+    told: tuple[str, ...]
+    calls: tuple[SkillCall | None, ...]
+    player: EpisodePlayer
+    hidden: int
+
+
+async def play_search(
+    episodes: LocalEpisodes,
+    scene: Scene,
+    record: TaskRecord,
+    priors: PlacePriors,
+    visibility: Visibility = Visibility.SEEN,
+    codec: Codec = Codec.LINES,
+) -> PlayedSearch:
+    """Play an episode of a task with the searching script, within the budget of a search."""
     situation, plan = situation_of(scene, record.task), oracle_plan(record)
     used = {index for call in plan for index in (call.object_index, call.source_index)}
     script = SearchingScript(
         plan, {row.index: row.category for row in situation.rows if row.index in used}, priors
     )
     budget = min(MAX_STEPS, CALLS_FACTOR * len(plan) + CALLS_MORE)
-    rules = EpisodeRules(Visibility.SEEN, calls=budget)
-    running = episodes.begin(record.bundle_digest, record.task.task_id, sight=True)
-    player = EpisodePlayer(running, situation, rules, Codec.LINES)
-    await player.begin()
+    sight = visibility is Visibility.SEEN
+    running = episodes.begin(record.bundle_digest, record.task.task_id, sight=sight)
+    player = EpisodePlayer(running, situation, EpisodeRules(visibility, calls=budget), codec)
+    prompt = await player.begin()
     hidden = used - player.observer.memory.keys() - {None}
+    told, calls = [prompt.user], []
     while player.end is None:
         last = player.steps[-1] if player.steps else None
         call = script.next_call(player.observer.situation, last)
-        await player.act(() if call is None else (call,), done=call is None)
-    return SearchResult(len(hidden), player.reward.tiers.success, player.reward.calls)
+        calls.append(call)
+        told.append((await player.act(() if call is None else (call,), done=call is None)).text)
+    return PlayedSearch(prompt, tuple(told[: len(calls)]), tuple(calls), player, len(hidden))
 
 
 def searches(records: Sequence[TaskRecord], results: SearchResults) -> list[TaskRecord]:

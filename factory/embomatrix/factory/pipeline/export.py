@@ -4,7 +4,7 @@ import hashlib
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -72,8 +72,20 @@ def _row(dataset: Dataset, record: TaskRecord) -> dict[str, Any]:
     }
 
 
-def encode_rows(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
-    """Encode the rows as a file. Raise DatasetError for an unknown suffix, or if pyarrow is missing."""
+def task_schema(arrow: Any) -> Any:
+    """Return the schema of task rows for a module ``pyarrow``."""
+    text, texts = arrow.string(), arrow.list_(arrow.string())
+    kinds = {"rooms": texts, "table": texts, "oracle_steps": arrow.int32()}
+    return arrow.schema([(name, kinds.get(name, text)) for name in FIELDS])
+
+
+def encode_rows(
+    rows: Sequence[Mapping[str, Any]], suffix: str, schema_of: Callable[[Any], Any] = task_schema
+) -> bytes:
+    """Encode the rows as a file. Raise DatasetError for an unknown suffix, or if pyarrow is missing.
+
+    ``schema_of`` returns the schema of a Parquet file for a module ``pyarrow``.
+    """
     if suffix == ".jsonl":
         return "".join(f"{json.dumps(row, ensure_ascii=False)}\n" for row in rows).encode("utf-8")
     if suffix != ".parquet":
@@ -84,11 +96,8 @@ def encode_rows(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
         raise DatasetError(
             "Parquet needs the package pyarrow: install it with `pip install 'embomatrix[export]'`, or export to .jsonl"
         ) from error
-    text, texts = arrow.string(), arrow.list_(arrow.string())
-    kinds = {"rooms": texts, "table": texts, "oracle_steps": arrow.int32()}
-    schema = arrow.schema([(name, kinds.get(name, text)) for name in FIELDS])
     out = io.BytesIO()
-    parquet.write_table(arrow.Table.from_pylist(list(rows), schema=schema), out, compression="zstd")
+    parquet.write_table(arrow.Table.from_pylist(list(rows), schema=schema_of(arrow)), out, compression="zstd")
     return out.getvalue()
 
 

@@ -1,0 +1,120 @@
+"""Episodes of the searching script as conversations: a prompt, and answers and observations in turns, for supervised tuning."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from embomatrix.envs.rules import Visibility
+from embomatrix.envs.turns import LocalEpisodes
+from embomatrix.factory.evaluate.scripts import by_bundle, situations_of
+from embomatrix.factory.evaluate.search import PlayedSearch, play_search
+from embomatrix.scripts.searching import PlacePriors
+from embomatrix.sim.process_pool import process_pool
+from embomatrix.skills.episode_text import EXAMPLES, FORMAT
+from embomatrix.skills.parse import plan_to_json, plan_to_lines
+from embomatrix.skills.prompt import Codec
+from embomatrix.skills.syntax import SkillCall
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+
+Row = dict[str, Any]
+_TEXTS: Final = ("task_id", "split", "scene_id", "category", "visibility", "codec")
+_COUNTS: Final = ("format", "calls", "hidden")
+
+
+@dataclass(frozen=True, slots=True)
+class ConversationForm:
+    """Form of conversations: what the robot shows, and how calls are written."""
+
+    visibility: Visibility
+    codec: Codec
+
+
+def conversations(
+    dataset: Dataset,
+    records: Sequence[TaskRecord],
+    form: ConversationForm,
+    *,
+    jobs: int,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> list[Row]:
+    """Return a row for each task that the script solves, in the order of the records.
+
+    The script learns from the dataset's training tasks where things usually are. ``messages`` of a row are a chat. Raises
+    DatasetError if a bundle can't be read or a process dies.
+    """
+    priors = PlacePriors(situations_of(dataset, dataset.train).values())
+    rows: dict[str, Row] = {}
+    done = 0
+    try:
+        with process_pool(jobs) as pool:
+            groups = list(by_bundle(records).values())
+            for group, found in zip(
+                groups, pool.map(partial(_talk, dataset.folder, priors, form), groups), strict=True
+            ):
+                rows |= {row["task_id"]: row for row in found}
+                done += len(group)
+                progress(done)
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            "a process that plays episodes died, perhaps out of memory: run the command again with fewer --jobs"
+        ) from error
+    return [rows[record.task.task_id] for record in records if record.task.task_id in rows]
+
+
+def _talk(
+    folder: Path, priors: PlacePriors, form: ConversationForm, records: Sequence[TaskRecord]
+) -> list[Row]:
+    """Play the tasks of one bundle."""
+    dataset = Dataset(folder, ())
+    scene = dataset.read_bundle(records[0].bundle_digest).scene
+    rows = []
+    with LocalEpisodes(dataset.read_bundle) as episodes:
+        for record in records:
+            played = asyncio.run(play_search(episodes, scene, record, priors, form.visibility, form.codec))
+            if played.player.reward.tiers.success:
+                rows.append(_row(record, played, form))
+    return rows
+
+
+def _row(record: TaskRecord, played: PlayedSearch, form: ConversationForm) -> Row:
+    messages = [{"role": "system", "content": played.prompt.system}]
+    for text, call in zip(played.told, played.calls, strict=True):
+        messages.append({"role": "user", "content": text})
+        messages.append({"role": "assistant", "content": _answer(call, form.codec)})
+    return {
+        "task_id": record.task.task_id,
+        "split": record.split,
+        "scene_id": record.task.scene_id,
+        "category": record.task.category.value,
+        "visibility": form.visibility.value,
+        "codec": form.codec.value,
+        "format": FORMAT,
+        "calls": played.player.reward.calls,
+        "hidden": played.hidden,
+        "messages": messages,
+    }
+
+
+def _answer(call: SkillCall | None, codec: Codec) -> str:
+    if call is None:
+        return EXAMPLES[codec][1]
+    return plan_to_lines((call,)) if codec is Codec.LINES else json.dumps(plan_to_json((call,))[0])
+
+
+def conversation_schema(arrow: Any) -> Any:
+    """Return the schema of the rows for a module ``pyarrow``."""
+    text = arrow.string()
+    message = arrow.struct([("role", text), ("content", text)])
+    kinds: Mapping[str, Any] = {
+        **dict.fromkeys(_TEXTS, text),
+        **dict.fromkeys(_COUNTS, arrow.int32()),
+        "messages": arrow.list_(message),
+    }
+    return arrow.schema(list(kinds.items()))
