@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,15 +12,14 @@ from typing import Any, Final
 
 from embomatrix.envs.rules import Visibility
 from embomatrix.envs.turns import LocalEpisodes
-from embomatrix.factory.evaluate.scripts import by_bundle, situations_of
+from embomatrix.factory.evaluate.scripts import by_bundle, in_processes, situations_of
 from embomatrix.factory.evaluate.search import PlayedSearch, play_search
 from embomatrix.scripts.searching import PlacePriors
-from embomatrix.sim.process_pool import process_pool
 from embomatrix.skills.episode_text import EXAMPLES, FORMAT
 from embomatrix.skills.parse import plan_to_json, plan_to_lines
 from embomatrix.skills.prompt import Codec
 from embomatrix.skills.syntax import SkillCall
-from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.dataset import Dataset, TaskRecord
 
 Row = dict[str, Any]
 _TEXTS: Final = ("task_id", "split", "scene_id", "category", "visibility", "codec")
@@ -50,21 +48,15 @@ def conversations(
     DatasetError if a bundle can't be read or a process dies.
     """
     priors = PlacePriors(situations_of(dataset, dataset.train).values())
+    groups, work = list(by_bundle(records).values()), partial(_talk, dataset.folder, priors, form)
     rows: dict[str, Row] = {}
     done = 0
-    try:
-        with process_pool(jobs) as pool:
-            groups = list(by_bundle(records).values())
-            for group, found in zip(
-                groups, pool.map(partial(_talk, dataset.folder, priors, form), groups), strict=True
-            ):
-                rows |= {row["task_id"]: row for row in found}
-                done += len(group)
-                progress(done)
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a process that plays episodes died, perhaps out of memory: run the command again with fewer --jobs"
-        ) from error
+    for group, found in zip(
+        groups, in_processes(work, groups, jobs=jobs, doing="plays episodes"), strict=True
+    ):
+        rows |= {row["task_id"]: row for row in found}
+        done += len(group)
+        progress(done)
     return [rows[record.task.task_id] for record in records if record.task.task_id in rows]
 
 

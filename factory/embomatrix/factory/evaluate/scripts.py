@@ -1,12 +1,12 @@
 """Scripts on a dataset: plans of ``template``, ``nearest`` and ``greedy``, executed in the simulator, and their success."""
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from embomatrix.factory.admission import oracle_plan, plan_failure
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
@@ -32,6 +32,8 @@ class ScriptName(StrEnum):
 
 GOALS: Final[Mapping[ScriptName, float]] = {ScriptName.TEMPLATE: 0.45, ScriptName.NEAREST: 0.30}
 """Largest success of a script on the held-out tasks of a dataset that needs more than its training phrases."""
+Group = TypeVar("Group")
+Result = TypeVar("Result")
 ScriptPlans = Mapping[str, Mapping[ScriptName, Plan]]
 """Plans by task id and script."""
 ScriptResults = Mapping[str, Mapping[ScriptName, bool]]
@@ -99,16 +101,23 @@ def run_scripts(
         (digest, {record.task.task_id: plans[record.task.task_id] for record in group})
         for digest, group in by_bundle(records).items()
     ]
+    for results in in_processes(work, groups, jobs=jobs, doing="executes scripts"):
+        found |= results
+        progress(len(found))
+    return found
+
+
+def in_processes(
+    work: Callable[[Group], Result], groups: Iterable[Group], *, jobs: int, doing: str
+) -> Iterator[Result]:
+    """Yield the results of the groups in their order. Raises DatasetError if a process dies; ``doing`` says at what work."""
     try:
         with process_pool(jobs) as pool:
-            for results in pool.map(work, groups):
-                found |= results
-                progress(len(found))
+            yield from pool.map(work, groups)
     except BrokenProcessPool as error:
         raise DatasetError(
-            "a process that executes scripts died, perhaps out of memory: run the command again with fewer --jobs"
+            f"a process that {doing} died, perhaps out of memory: run the command again with fewer --jobs"
         ) from error
-    return found
 
 
 def _run_bundle(folder: Path, group: tuple[str, ScriptPlans]) -> dict[str, Mapping[ScriptName, bool]]:
@@ -154,13 +163,22 @@ def evaluate_scripts(
     counter: Callable[[str, int], contextlib.AbstractContextManager[Callable[[int], None]]],
 ) -> EvaluationFigures:
     """Measure the scripts on the held-out split of a dataset. Raises EvaluationError for one without held-out tasks."""
+    dataset, learned, conditions = held_out_of(folder, training)
+    plans = write_plans(dataset, dataset.heldout, learned)
+    with counter("tasks", len(dataset.heldout)) as count:
+        results = run_scripts(dataset, dataset.heldout, plans, jobs=jobs, progress=count)
+    return evaluation_of(results, conditions)
+
+
+def held_out_of(folder: Path, training: Path | None) -> tuple[Dataset, Dataset, dict[str, str | int]]:
+    """Return a dataset with held-out tasks, the one whose training tasks are learned from, and conditions of measurement.
+
+    Raises EvaluationError for a dataset without held-out tasks.
+    """
     dataset = Dataset.load(folder)
     learned = dataset if training is None else Dataset.load(training)
     if not dataset.heldout:
         raise EvaluationError(f"{folder} has no held-out tasks: build it with --heldout")
-    plans = write_plans(dataset, dataset.heldout, learned)
-    with counter("tasks", len(dataset.heldout)) as count:
-        results = run_scripts(dataset, dataset.heldout, plans, jobs=jobs, progress=count)
     conditions: dict[str, str | int] = {
         "dataset": dataset.folder.name,
         "training tasks": len(learned.train),
@@ -168,4 +186,4 @@ def evaluate_scripts(
     }
     if training is not None:
         conditions["learned from"] = f"{learned.folder.parent.name}/{learned.folder.name}"
-    return evaluation_of(results, conditions)
+    return dataset, learned, conditions

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,14 +18,13 @@ from embomatrix.envs.player import EpisodePlayer
 from embomatrix.envs.rules import EpisodeRules, Visibility
 from embomatrix.envs.turns import LocalEpisodes
 from embomatrix.factory.admission import oracle_plan
-from embomatrix.factory.evaluate.scripts import by_bundle, situations_of
-from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
+from embomatrix.factory.evaluate.scripts import by_bundle, held_out_of, in_processes, situations_of
+from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.pages.figures import Better, Figure, wilson
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
-from embomatrix.sim.process_pool import process_pool
 from embomatrix.skills.prompt import Codec, Prompt, situation_of
 from embomatrix.skills.syntax import MAX_STEPS, SkillCall
-from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.dataset import Dataset, TaskRecord
 from embomatrix.world.scene import Scene
 
 CALLS_FACTOR: Final = 2
@@ -70,17 +68,10 @@ def search_tasks(
     """
     priors = PlacePriors(situations_of(training, training.train).values())
     found: dict[str, SearchResult] = {}
-    try:
-        with process_pool(jobs) as pool:
-            for results in pool.map(
-                partial(_search_bundle, dataset.folder, priors), by_bundle(records).values()
-            ):
-                found |= results
-                progress(len(found))
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a process that searches died, perhaps out of memory: run the command again with fewer --jobs"
-        ) from error
+    work = partial(_search_bundle, dataset.folder, priors)
+    for results in in_processes(work, by_bundle(records).values(), jobs=jobs, doing="searches"):
+        found |= results
+        progress(len(found))
     return found
 
 
@@ -180,15 +171,7 @@ def evaluate_search(
     counter: Callable[[str, int], contextlib.AbstractContextManager[Callable[[int], None]]],
 ) -> EvaluationFigures:
     """Measure searches on the held-out split of a dataset. Raises EvaluationError for one without held-out tasks."""
-    dataset = Dataset.load(folder)
-    learned = dataset if training is None else Dataset.load(training)
-    if not dataset.heldout:
-        raise EvaluationError(f"{folder} has no held-out tasks: build it with --heldout")
+    dataset, learned, conditions = held_out_of(folder, training)
     with counter("tasks", len(dataset.heldout)) as count:
         results = search_tasks(dataset, dataset.heldout, learned, jobs=jobs, progress=count)
-    conditions: dict[str, str | int] = {
-        "dataset": dataset.folder.name,
-        "training tasks": len(learned.train),
-        "held-out tasks": len(dataset.heldout),
-    }
     return evaluation_of(results, conditions)
