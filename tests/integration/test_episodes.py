@@ -185,6 +185,15 @@ def test_first_example_of_the_page_plays_the_printed_episode():
     assert (end, reward, len(conversation)) == (EpisodeEnd.DONE, -1.0, 4)
 
 
+def test_example_of_the_readme_tells_of_the_kitchen(capsys):
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    [block] = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    exec(compile(block, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "Task: " in printed
+    assert "go_to_room kitchen_0: " in printed
+
+
 async def test_examples_of_the_page_run_and_agree(tmp_path):
     names = names_of_the_page()
     async with real_cluster(tmp_path, "w1") as (cluster, _, _):

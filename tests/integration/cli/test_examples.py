@@ -56,6 +56,7 @@ CHECKED = Counter(
         ("spare_pcs.md", "toml"): 1,
         ("spare_pcs.md", "xml"): 1,  # test_property_list_of_the_page_runs_a_worker
         ("operations.md", "json"): 1,  # test_log_line_of_the_page_has_the_fields_of_a_log_line
+        ("README.md", "python"): 1,  # tests/integration/test_episodes.py
         ("README.md", "plan"): 1,  # test_plan_of_the_readme_earns_the_printed_reward
         ("README.md", "mermaid"): 1,  # `make diagrams`
         ("architecture.md", "mermaid"): 2,
