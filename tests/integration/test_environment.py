@@ -87,10 +87,23 @@ def test_many_episodes_are_played_side_by_side(dataset):
             environment.answer(episodes[:1], ["move 1"])
 
 
+def test_visibility_and_rules_go_together(dataset):
+    rules = EpisodeRules(calls=5)
+    with make(dataset, visibility="seen", rules=rules) as environment:
+        assert (environment.rules.visibility, environment.rules.calls) == (Visibility.SEEN, 5)
+    with make(dataset, rules=EpisodeRules(Visibility.SEEN)) as environment:
+        assert environment.rules.visibility is Visibility.SEEN
+
+
 def test_misuse_is_named(dataset):
     with make(dataset) as environment:
         with pytest.raises(RuntimeError, match="call reset first"):
             environment.step("move 1")
+        with pytest.raises(ValueError, match="found 2 answers for 1 episodes"):
+            environment.answer(environment.begin([(environment.task_ids[0], 0)]), ["move 1", "move 2"])
+        environment.reset()
+        with pytest.raises(ValueError, match="an answer is NoneType: expected a text"):
+            environment.step(None)
         with pytest.raises(DatasetError, match="there is no task 'absent'"):
             environment.reset("absent")
     with pytest.raises(DatasetError, match="no task of the split 'train'"):

@@ -28,6 +28,7 @@ from embomatrix.cli.evaluation_subjects import (
     policy_subject,
     written_baseline,
 )
+from embomatrix.envs.rules import Visibility
 from embomatrix.host.failure import INTERRUPTED, fail, unwritable
 from embomatrix.host.own_files import is_own, prepare_output
 from embomatrix.host.printable import printable
@@ -115,7 +116,7 @@ def evaluate(
             _BENCH,
             "--bench",
             "--dataset",
-            help="eai-native, eai, internal-verified-2, the folder of a dataset, or a file of task records. "
+            help="starter, internal-verified-2, eai-native, eai, the folder of a dataset, or a file of task records. "
             f"Default: ${DATASET_VARIABLE}, or {DEFAULT_DATASET}.",
         ),
     ] = "",
@@ -163,6 +164,8 @@ def evaluate(
         if training is not None and baseline not in SCRIPTS:
             raise TrainerError(f"--training is for the baselines {' and '.join(SCRIPTS)}: leave it out")
         label = model or model_name or str(baseline)
+        if settings.visibility is Visibility.SEEN and not settings.interactive:
+            raise TrainerError("--visibility seen is for episodes: pass --interactive, or leave it out")
         if settings.interactive and (model or bench == NATIVE):
             raise TrainerError(
                 "--interactive plays endpoints and baselines on our own tasks: serve a model with an OpenAI-compatible server "

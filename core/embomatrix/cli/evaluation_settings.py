@@ -62,7 +62,7 @@ class EvalSettings(BaseModel):
     """Play episodes: one call an answer, each after the observation of the last (docs/episodes.md)."""
     visibility: Visibility = Visibility.FULL
     """Part of the task that episodes show. full: the whole table of the task. seen: what the robot has seen."""
-    calls_factor: float = Field(2.0, ge=0, le=64)
+    calls_factor: float = Field(2.0, ge=1, le=64)
     """Budget of calls of an episode, as a multiple of the oracle's."""
     calls_more: int = Field(12, ge=0, le=MAX_STEPS)
     """Calls of an episode besides."""

@@ -74,7 +74,7 @@ def explore_by_hand(
 ) -> EpisodeReward | None:
     """Play an episode of the environment by the lines that ``read`` returns, None at the end of the input.
 
-    Return the reward of the state reached, None without any call.
+    Return the reward of the state reached, None if no call succeeded.
     """
     (episode,) = environment.begin([(task_id, seed)])
     show(episode.prompt.user)
@@ -84,14 +84,15 @@ def explore_by_hand(
         if words == ["help"]:
             show("\n".join([EXPLORING, *map(signature, PROFILES[player.observer.situation.profile])]))
         elif words == ["state"]:
-            show(prompt_for(player.observer.situation, Codec.LINES).user)
+            rooms = ", ".join(player.observer.situation.home)
+            show(f"Rooms: {rooms}\n{prompt_for(player.observer.situation, Codec.LINES).user}")
         elif words:
             (observation,) = environment.answer([episode], [line])
             show(observation.text)
             if observation.end is not None:
                 show(f"the episode is over: {observation.end}")
                 break
-    return player.reward if player.steps else None
+    return player.reward if any(step.ok for step in player.steps) else None
 
 
 def signature(skill: Skill) -> str:

@@ -8,15 +8,14 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Coroutine, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 import numpy as np
 
 from embomatrix.envs.player import EpisodePlayer, Observation
-from embomatrix.envs.rules import EpisodeRules, Visibility
+from embomatrix.envs.rules import EpisodeRules, Visibility, member
 from embomatrix.skills.prompt import Codec, Prompt, situation_of
 from embomatrix.starter.shipped import unpacked_tasks
 from embomatrix.world.dataset import SPLITS, Dataset, DatasetError
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 STARTER: Final = "starter"
 """Name of the shipped dataset."""
 T = TypeVar("T")
-E = TypeVar("E", bound=StrEnum)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +114,17 @@ class Environment:
         return self._wait(_all([self._begin(record, seed) for record, seed in records]))
 
     def answer(self, episodes: Sequence[PlayedEpisode], texts: Sequence[str]) -> tuple[Observation, ...]:
-        """Take one answer for each of the episodes, and execute them together."""
+        """Take one answer for each of the episodes, and execute them together.
+
+        Raises ValueError for another number of answers, and for one that is no text.
+        """
+        if len(episodes) != len(texts):
+            raise ValueError(
+                f"found {len(texts)} answers for {len(episodes)} episodes: expected one for each"
+            )
+        for text in texts:
+            if not isinstance(text, str):
+                raise ValueError(f"an answer is {type(text).__name__}: expected a text")
         return self._wait(
             _all([each.player.answer(text) for each, text in zip(episodes, texts, strict=True)])
         )
@@ -150,7 +158,7 @@ def make(
     dataset: str | Path = STARTER,
     *,
     split: str = "heldout",
-    visibility: str = Visibility.FULL,
+    visibility: str | None = None,
     rules: EpisodeRules | None = None,
     codec: str = Codec.LINES,
     manager: str = "",
@@ -160,13 +168,15 @@ def make(
 ) -> Environment:
     """Open an environment over the tasks of a dataset: ``starter``, the shipped one, or a folder.
 
-    ``visibility`` is ``full`` or ``seen``; ``rules`` set all rules instead. ``codec`` is ``lines``, ``json`` or ``names``.
-    With the address of a ``manager``, turns are executed on its cluster, else in this process. ``seed`` draws tasks.
+    ``visibility`` is ``full`` or ``seen``, that of the ``rules`` if it is not given; ``codec`` is ``lines``, ``json`` or
+    ``names``. With the address of a ``manager``, turns are executed on its cluster, else in this process. ``seed`` draws tasks.
 
     Raises ValueError for an unknown word, DatasetError for a missing dataset, ClusterError if the manager refuses.
     """
-    known = rules or EpisodeRules(_member(Visibility, "visibility", visibility))
-    form = _member(Codec, "codec", codec)
+    known = EpisodeRules() if rules is None else rules
+    if visibility is not None:
+        known = replace(known, visibility=member(Visibility, "visibility", visibility))
+    form = member(Codec, "codec", codec)
     loaded = Dataset.load(unpacked_tasks() if dataset == STARTER else dataset)
     simulation = _simulation(loaded, manager, token, ca)
     return Environment(loaded, split, known, form, simulation, seed)
@@ -182,13 +192,6 @@ def _simulation(dataset: Dataset, address: str, token: str, ca: bytes) -> Simula
     from embomatrix.rpc.client import ClusterClient
 
     return ClusterSimulation(dataset, lambda: ClusterClient(address, token, ca=ca))
-
-
-def _member(kind: type[E], name: str, value: str) -> E:
-    try:
-        return kind(value)
-    except ValueError:
-        raise ValueError(f"{name} is {value!r}: expected one of {', '.join(kind)}") from None
 
 
 async def _all(work: Sequence[Coroutine[object, object, T]]) -> tuple[T, ...]:

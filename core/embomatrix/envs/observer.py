@@ -64,11 +64,14 @@ class Observer:
         )
         return subset(known, rows) if self._seen else known
 
-    def begin(self, start: TurnObservation | None = None) -> Prompt:
-        """Prompt at the start. With ``Visibility.SEEN``, ``start`` is the observation of a look."""
+    def begin(self, start: TurnObservation | None, at_once: int) -> Prompt:
+        """Prompt at the start. With ``Visibility.SEEN``, ``start`` is the observation of a look.
+
+        ``at_once`` is the number of calls that an answer may have.
+        """
         if start is not None:
             self._follow(start, 0)
-        return opening(self.situation, self._codec, seen=self._seen)
+        return opening(self.situation, self._codec, seen=self._seen, at_once=at_once)
 
     def refusal(self, call: SkillCall) -> Step | None:
         """Return the failed step of a call with a row that the policy does not know; None for other calls.

@@ -14,7 +14,7 @@ from embomatrix.envs.observer import Observer
 from embomatrix.envs.rules import EpisodeEnd, EpisodeReward, EpisodeRules, Visibility
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.skills.episode_text import not_an_action
+from embomatrix.skills.episode_text import left_out, not_an_action
 from embomatrix.skills.parse import PlanError, parse_answer
 from embomatrix.skills.prompt import Codec, with_indices
 
@@ -62,13 +62,13 @@ class EpisodePlayer:
         """Outcomes of all calls so far, refused ones included."""
         self.end: EpisodeEnd | None = None
         self.reward = EpisodeReward(unparsable(reward))
-        self._repeated: SkillCall | None = None
+        self._repeated: SkillCall | str = ""
         self._repeats = 0
 
     async def begin(self) -> Prompt:
         """Return the opening prompt. Raises what ``RunningEpisode.act`` raises."""
         start = (await self._running.look()).observation if self._seen else None
-        return self.observer.begin(start)
+        return self.observer.begin(start, self._rules.calls_per_answer)
 
     async def answer(self, text: str) -> Observation:
         """Take a policy's answer: one call, or ``done``. Text without a call counts as a failed call.
@@ -76,25 +76,30 @@ class EpisodePlayer:
         Raises RuntimeError after the end, and what ``RunningEpisode.act`` raises; then the episode is as before.
         """
         calls, done, notes = self._read(text)
-        return await self.act(calls, done=done, notes=notes)
+        return await self.act(calls, done=done, notes=notes, text=text)
 
     async def act(
-        self, calls: Sequence[SkillCall], *, done: bool = False, notes: Sequence[str] = ()
+        self,
+        calls: Sequence[SkillCall],
+        *,
+        done: bool = False,
+        notes: Sequence[str] = (),
+        text: str = "",
     ) -> Observation:
-        """Execute calls up to the first failure, as ``answer`` does with those of a text. ``done`` ends the episode."""
+        """Execute calls up to the first failure, as ``answer`` does with those of a ``text``. ``done`` ends the episode."""
         if self.end is not None:
             raise RuntimeError(f"the episode is over ({self.end}): begin another")
         most = min(self._rules.calls_per_answer, self._rules.calls - self.reward.calls)
         if len(calls) > most:
-            notes = (*notes, f"Of {len(calls)} actions, the first {most} were carried out.")
+            notes = (*notes, left_out(len(calls), most))
             done = False
         steps, turn = await self._execute(calls[:most])
         self.steps += steps
-        self._count(steps, turn, unread=not steps and not done)
+        self._count(steps, turn, unread=None if steps or done else text)
         observed = turn.observation if turn is not None else None
-        text = self.observer.tell(steps, observed, self.reward.calls, notes)
+        told = self.observer.tell(steps, observed, self.reward.calls, notes)
         self.end = self._ending(done=done and all(step.ok for step in steps))
-        return Observation(text, tuple(steps), self.reward, self.end)
+        return Observation(told, tuple(steps), self.reward, self.end)
 
     def stop(self, end: EpisodeEnd = EpisodeEnd.TOKENS) -> None:
         """End the episode from outside."""
@@ -123,16 +128,16 @@ class EpisodePlayer:
             steps.append(refused)
         return steps, turn
 
-    def _count(self, steps: Sequence[Step], turn: Turn | None, *, unread: bool) -> None:
-        """Count the calls of an answer, or an answer that could not be read, and how often one failed in a row."""
+    def _count(self, steps: Sequence[Step], turn: Turn | None, *, unread: str | None) -> None:
+        """Count the calls of an answer, or an answer that could not be read, and how often the same one failed in a row."""
         for step in steps:
             self._repeats = 0 if step.ok else 1 + (self._repeats if step.call == self._repeated else 0)
             self._repeated = step.call
-        if unread:
-            self._repeats = 1 + (self._repeats if self._repeated is None else 0)
-            self._repeated = None
-        calls = self.reward.calls + len(steps) + unread
-        failures = self.reward.failures + sum(not step.ok for step in steps) + unread
+        if unread is not None:
+            self._repeats = 1 + (self._repeats if unread == self._repeated else 0)
+            self._repeated = unread
+        calls = self.reward.calls + len(steps) + (unread is not None)
+        failures = self.reward.failures + sum(not step.ok for step in steps) + (unread is not None)
         cost = self._rules.call_cost * calls + self._rules.failure_cost * failures
         tiers = turn.reward if turn is not None else self.reward.tiers
         self.reward = EpisodeReward(tiers, calls, failures, cost)

@@ -2,12 +2,23 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, TypeVar
 
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.syntax import MAX_STEPS
 
 EQUAL_FAILURES: Final = 4
+
+
+E = TypeVar("E", bound=StrEnum)
+
+
+def member(kind: type[E], name: str, value: str) -> E:
+    """Return the member of an enumeration. Raises ValueError with all members for another word."""
+    try:
+        return kind(value)
+    except ValueError:
+        raise ValueError(f"{name} is {value!r}: expected one of {', '.join(kind)}") from None
 
 
 class Visibility(StrEnum):
@@ -56,16 +67,19 @@ class EpisodeRules:
     """Subtracted from the episode's reward for each failed call, besides ``call_cost``."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "visibility", member(Visibility, "visibility", self.visibility))
         for name, low, high in (
             ("calls", 1, MAX_STEPS),
             ("calls_per_answer", 1, MAX_STEPS),
             ("equal_failures", 0, MAX_STEPS),
         ):
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected {low} to {high}")
+            value = getattr(self, name)
+            if not isinstance(value, int) or not low <= value <= high:
+                raise ValueError(f"{name} is {value!r}: expected a whole number from {low} to {high}")
         for name in ("call_cost", "failure_cost"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} is {getattr(self, name)}: expected 0 or a positive number")
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
+                raise ValueError(f"{name} is {value!r}: expected 0 or a positive number")
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.skills.prompt import plain_words
 from embomatrix.skills.syntax import Skill, SkillCall
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 UNKNOWN: Final = 0.5
 """Count of a place in which a category was never seen."""
+NAMED: Final = 4.0
+"""Factor for a place that the instruction names."""
 NOWHERE: Final = ""
 """Host of an object on the floor."""
 _ASIDE: Final = 0.1
@@ -145,21 +148,25 @@ class SearchingScript:
     def _places(self, known: Situation, missing: set[int]) -> Iterator[_Place]:
         """Yield the places that were not looked at yet."""
         wanted = [self._categories[index] for index in sorted(missing)]
+        said = f" {plain_words(known.instruction)} "
         for room in known.home:
             if room not in self._looked:
                 chance = sum(self._priors.room(category, room_kind(room)) for category in wanted)
+                chance *= NAMED if f" {room_kind(room).replace('_', ' ')} " in said else 1.0
                 yield _Place(room, (SkillCall(Skill.GO_TO_ROOM, room_name=room),), chance)
         for row in known.rows:
             if row.name in self._looked or not row.fixed:
                 continue
             move = SkillCall(Skill.MOVE, object_index=row.index)
-            in_room = sum(self._priors.room(category, room_kind(row.room)) for category in wanted)
+            named = NAMED if f" {row.category.replace('_', ' ')} " in said else 1.0
+            in_room = named * sum(self._priors.room(category, room_kind(row.room)) for category in wanted)
             if "closed" in row.states:
                 chance = sum(
                     self._priors.room(category, room_kind(row.room))
                     * self._priors.host(category, row.category)
                     for category in wanted
                 )
-                yield _Place(row.name, (move, SkillCall(Skill.OPEN, object_index=row.index)), chance)
+                open_ = SkillCall(Skill.OPEN, object_index=row.index)
+                yield _Place(row.name, (move, open_), named * chance)
             else:
                 yield _Place(row.name, (move,), _ASIDE * in_room)

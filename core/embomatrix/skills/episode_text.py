@@ -50,24 +50,34 @@ EXAMPLES: Final[Mapping[Codec, tuple[str, str]]] = {
     Codec.JSON: ('{"action": "open", "object_index": 2}', f'{{"action": "{DONE}"}}'),
 }
 """Answers with a call and at the end, in each codec of language models."""
+_FORMS: Final[Mapping[tuple[Codec, bool], str]] = {
+    (Codec.LINES, False): "one action",
+    (Codec.LINES, True): "the next actions, at most {count}, one a line",
+    (Codec.JSON, False): "one action as a JSON object",
+    (Codec.JSON, True): "the next actions, at most {count}, as a JSON array",
+}
+"""Form of an answer with one action, and with several."""
 _SEEN: Final = (
     " You know only what the robot has seen: its camera looks all around, but not through walls, furniture and closed doors. "
     "Go to rooms, come near and open containers to find things."
 )
 
 
-def opening(situation: Situation, codec: Codec, *, seen: bool) -> Prompt:
-    """Prompt at the start of an episode. With ``seen``, the situation holds only the rows that the robot has seen."""
+def opening(situation: Situation, codec: Codec, *, seen: bool, at_once: int) -> Prompt:
+    """Prompt at the start of an episode. With ``seen``, the situation holds only the rows that the robot has seen.
+
+    ``at_once`` is the number of calls that an answer may have.
+    """
     prompt = prompt_for(situation, codec)
     if codec is Codec.NAMES:
         return prompt
     rooms = f"Rooms: {', '.join(situation.home)}\n" if seen else ""
-    return Prompt(_system(codec, situation.profile, seen=seen), rooms + prompt.user)
+    return Prompt(_system(codec, situation.profile, seen=seen, at_once=at_once), rooms + prompt.user)
 
 
-def _system(codec: Codec, profile: Profile, *, seen: bool) -> str:
+def _system(codec: Codec, profile: Profile, *, seen: bool, at_once: int) -> str:
     call, end = EXAMPLES[codec]
-    form = "one action" if codec is Codec.LINES else "one action as a JSON object"
+    form = _FORMS[codec, at_once > 1].format(count=at_once)
     actions = (
         f"Actions: {skill_lines(profile)} | {DONE}"
         if codec is Codec.LINES
@@ -143,10 +153,18 @@ class Wording:
 
 def not_an_action(error: PlanError, codec: Codec) -> str:
     """Sentence about an answer that is neither a call nor ``DONE``."""
-    if error.reason is not PlanReason.NO_PLAN:
-        return f"Not an action: {error}"
     call, end = EXAMPLES.get(codec, EXAMPLES[Codec.LINES])
-    return f"Not an action: expected one such as {call}, or {end}"
+    if error.reason is PlanReason.NO_PLAN:
+        return f"Not an action: expected one on a line of its own, such as {call}, or {end}"
+    reason = str(error).removeprefix("step 1: ").replace("a row of the object table", "that of an object")
+    also = f", {DONE}" if error.reason is PlanReason.UNKNOWN_SKILL else ""
+    return f"Not an action: {reason}{also}"
+
+
+def left_out(found: int, most: int) -> str:
+    """Sentence about an answer with more calls than are carried out at once."""
+    done = "one was" if most == 1 else f"{most} were"
+    return f"Of {found} actions, the first {done} carried out, and the others left out."
 
 
 def observation_text(

@@ -61,6 +61,9 @@ _READ_TIMES: Final = 8
 read again from each bracket."""
 _JSON_START: Final = re.compile(r"\[\s*\{|\{\s*\"")
 _LIST_MARK: Final = re.compile(r"^\s*(?:\d+[.)]|[-*])\s+")
+_AROUND: Final = " \t`*.!"
+_ANSWER_MARK: Final = re.compile(r"^(?:(?:next )?action|answer)\s*:\s*", re.IGNORECASE)
+_CALL_IN_BRACKETS: Final = re.compile(r"([A-Za-z_]+)\(([^()]*)\)")
 _WORD: Final = re.compile(r"[A-Za-z_]+")
 _ARGUMENT: Final = re.compile(
     r"[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|nan|inf|infinity)|ontop|inside|under|nextto", re.IGNORECASE
@@ -89,12 +92,12 @@ def parse_answer(text: str, profile: Profile = Profile.PAPER) -> tuple[Plan, boo
         before = [*itertools.takewhile(lambda step: not _is_done(step), values)]
         done = len(before) < len(values)
         return (plan_from_json(before, profile) if before or not done else ()), done
-    segments = [*_segments(answer)]
+    segments = [words for line in _plain_lines(answer) for words in _segments(line)]
     lines = [*itertools.takewhile(lambda words: not _ends(words), segments)]
     done = len(lines) < len(segments)
     if done and not any(_is_call(words, profile) for words in lines):
         return (), True
-    return _parse_lines("\n".join(map(" ".join, lines)) if done else answer, profile), done
+    return _parse_lines("\n".join(map(" ".join, lines)) if lines else answer, profile), done
 
 
 def prose_lines(text: str, profile: Profile) -> list[str]:
@@ -150,6 +153,14 @@ def _answer_in(text: str) -> str:
     return _without_reasoning(text)
 
 
+def _plain_lines(answer: str) -> Iterator[str]:
+    """Yield the lines without the marks that models put around a call: `` `open 2` ``, ``Action: open 2``, ``open(2)``."""
+    for line in answer.splitlines():
+        plain = _ANSWER_MARK.sub("", line.strip(_AROUND)).strip(_AROUND)
+        call = _CALL_IN_BRACKETS.fullmatch(plain)
+        yield f"{call[1]} {call[2].replace(',', ' ')}" if call else plain
+
+
 def _calls_in(value: object) -> Sequence[object] | None:
     """Return the array of calls in a JSON value, that of a single call included; None if there is none."""
     if isinstance(value, dict) and isinstance(value.get("action"), str):
@@ -163,7 +174,7 @@ def _is_done(value: object) -> bool:
 
 
 def _ends(words: Sequence[str]) -> bool:
-    return len(words) == 1 and words[0].lower().rstrip(".") == DONE
+    return len(words) == 1 and words[0].lower().rstrip(".!") == DONE
 
 
 def _without_reasoning(text: str) -> str:

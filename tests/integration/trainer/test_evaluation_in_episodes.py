@@ -187,6 +187,7 @@ def test_command_plays_episodes_and_judges_them_again(bench, tmp_path):
         (("--model=runs/a",), "--interactive plays endpoints and baselines on our own tasks"),
         (("--baseline=template",), "the baseline `template` writes whole plans: leave out --interactive"),
         (("--baseline=human",), "the human plans are of eai-native: pass --baseline oracle"),
+        (("--baseline=oracle", "--calls-factor=0"), "calls_factor"),
         (("--baseline=oracle", "--visibility=half"), "Invalid value for '--visibility'"),
     ],
 )
@@ -195,3 +196,8 @@ def test_command_refuses_what_plays_no_episodes(bench, tmp_path, arguments, word
         *arguments, "--interactive", f"--bench={bench.folder}", f"--out={tmp_path / 'out'}"
     )
     assert (code, words in printed) == (2, True), printed
+
+
+def test_plans_show_the_whole_table(bench):
+    code, printed = run_evaluation("--baseline=oracle", "--visibility=seen", f"--bench={bench.folder}")
+    assert (code, "--visibility seen is for episodes: pass --interactive" in printed) == (2, True)

@@ -143,6 +143,7 @@ def test_situation_of_the_memory_is_a_prompt_from_here_on():
         (["pick_up 3"] * 9, EpisodeRules(equal_failures=0), None, 9, 9),
         (["hello"] * 4, FULL, EpisodeEnd.LOOP, 4, 4),
         (["hello", "move 0"] * 4, FULL, None, 8, 4),
+        (["hello", "hi", "hey", "ho", "ha"], FULL, None, 5, 5),
         (["pick_up 3\ndone"], FULL, None, 1, 1),
         (["move 0\nmove 1\ndone"], FULL, None, 1, 0),
         (["move 0\nmove 1\ndone"], EpisodeRules(calls_per_answer=2), EpisodeEnd.DONE, 2, 0),
@@ -163,9 +164,15 @@ def test_over_is_over():
 
 def test_answers_that_are_no_call_are_told_so():
     _, _, _, (prose, two, wrong) = play(["hello", "move 0; move 1", "move 1.5"])
-    assert prose.text.startswith("Not an action: expected one such as open 2, or done\n")
-    assert two.text.startswith("Of 2 actions, the first 1 were carried out.\nmove 0: did it to table 0\n")
-    assert wrong.text.startswith("Not an action: step 1: object_index is 1.5: expected a whole number")
+    assert prose.text.startswith(
+        "Not an action: expected one on a line of its own, such as open 2, or done\n"
+    )
+    assert two.text.startswith(
+        "Of 2 actions, the first one was carried out, and the others left out.\nmove 0: did it to table 0\n"
+    )
+    assert wrong.text.startswith(
+        "Not an action: object_index is 1.5: expected a whole number, that of an object\n"
+    )
 
 
 def test_costs_are_subtracted_and_told_apart():
@@ -190,9 +197,12 @@ def test_word_level_policies_use_names():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"calls": 0}, "calls is 0: expected 1 to 64"),
-        ({"calls_per_answer": 65}, "calls_per_answer is 65: expected 1 to 64"),
-        ({"equal_failures": -1}, "equal_failures is -1: expected 0 to 64"),
+        ({"calls": 0}, "calls is 0: expected a whole number from 1 to 64"),
+        ({"calls_per_answer": 65}, "calls_per_answer is 65: expected a whole number from 1 to 64"),
+        ({"equal_failures": -1}, "equal_failures is -1: expected a whole number from 0 to 64"),
+        ({"calls": 3.5}, "calls is 3.5: expected a whole number from 1 to 64"),
+        ({"call_cost": "a"}, "call_cost is 'a': expected 0 or a positive number"),
+        ({"visibility": "some"}, "visibility is 'some': expected one of full, seen"),
         ({"call_cost": -1.0}, "call_cost is -1.0: expected 0 or a positive number"),
         ({"failure_cost": float("nan")}, "failure_cost is nan: expected 0 or a positive number"),
     ],
@@ -206,3 +216,14 @@ def test_rules_of_sight_need_an_episode_with_sight():
     running = RunningEpisode(EpisodeStart("sha256:0", "t", 0), Kitchen().take_turn)
     with pytest.raises(ValueError, match="expected an episode with sight"):
         EpisodePlayer(running, SITUATION, SEEN)
+
+
+def test_policy_is_told_how_many_calls_an_answer_may_have():
+    _, _, one, _ = play([])
+    _, _, several, _ = play([], EpisodeRules(calls_per_answer=3))
+    assert "Answer only with one action;" in one.system
+    assert "Answer only with the next actions, at most 3, one a line;" in several.system
+
+
+def test_words_for_the_visibility_are_its_members():
+    assert EpisodeRules(visibility="seen") == SEEN

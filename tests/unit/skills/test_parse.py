@@ -315,6 +315,12 @@ def test_work_on_brackets_that_never_close_grows_linearly(piece):
         ('{"action": "done"}', 0, True),
         ('{"plan": [{"action": "done"}]}', 0, True),
         ("<think>done</think>move 3", 1, False),
+        ("Action: `move 3`", 1, False),
+        ("**open(3)**.", 1, False),
+        ("place(3, inside)", 1, False),
+        ("move_forward 0.5 0.25", 1, False),
+        ("pick_up 3.", 1, False),
+        ("Done!", 0, True),
     ],
 )
 def test_answer_of_an_episode_has_calls_and_may_end_it(text, calls, done):

@@ -23,6 +23,8 @@ NAMED: Final[Mapping[str, tuple[Path, str]]] = {
     "eai": (Path("build/eai"), "embomatrix factory import"),
 }
 """Benchmarks that a command creates, with their folders."""
+STARTER: Final = "starter"
+"""Dataset that ships with the package."""
 VERIFIED: Final = "internal-verified-2"
 """Benchmark that ships with the package: the hardest held-out tasks of the corpus."""
 
@@ -91,9 +93,11 @@ def find_benchmark(
     """
     if named == VERIFIED:
         return _verified(split, limit, profile)
-    path = NAMED[named][0] if named in NAMED else Path(named)
+    path = _path_of(named)
     if not path.exists():
-        remedy = f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join((VERIFIED, *NAMED))}"
+        remedy = (
+            f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join((STARTER, VERIFIED, *NAMED))}"
+        )
         if named in NAMED:
             remedy = f"create it with `{NAMED[named][1]}`, or pass its folder"
         raise TrainerError(f"no benchmark at {path}: {remedy}")
@@ -101,6 +105,15 @@ def find_benchmark(
     records = _read_records(path)
     chosen, found_split = _select_split(records, split, path)
     return _within(Benchmark(named, folder, found_split, chosen, _rejected(folder), records), limit, profile)
+
+
+def _path_of(named: str) -> Path:
+    if named == STARTER and not Path(named).exists():
+        try:
+            return unpacked_tasks()
+        except (DatasetError, OSError) as error:
+            raise TrainerError(f"the starter dataset can't be unpacked: {error}") from error
+    return NAMED[named][0] if named in NAMED else Path(named)
 
 
 def _verified(split: str, limit: int | None, profile: Profile) -> Benchmark:

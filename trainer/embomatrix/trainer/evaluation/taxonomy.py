@@ -43,7 +43,7 @@ MEANINGS: Final[Mapping[Cause, str]] = {
     Cause.UNREACHABLE: "the robot or its arm can't reach the target",
     Cause.NO_ROOM: "there is no free place for the object",
     Cause.MISHAP: "physical mode: the robot collided, or the object slipped or fell",
-    Cause.GOAL_NOT_MET: "all steps succeeded, but the goal does not hold",
+    Cause.GOAL_NOT_MET: "no failed step ended it, but the goal does not hold",
 }
 """Explanation of each cause."""
 
