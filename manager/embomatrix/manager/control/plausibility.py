@@ -23,8 +23,12 @@ def contradiction(completed: Completed, rollout: Rollout, settings: RewardSettin
             "it has an observation, and its rollout is no turn" if prefix is None else "it has no observation"
         )
     before, plan = _split(rollout)
-    return _wrong_sight(completed, rollout) or _wrong_steps(completed.steps, plan) or _wrong_reward(
-        completed.reward, (*before, *(step.call for step in completed.steps if step.ok)), settings
+    return (
+        _wrong_sight(completed, rollout)
+        or _wrong_steps(completed.steps, plan)
+        or _wrong_reward(
+            completed.reward, (*before, *(step.call for step in completed.steps if step.ok)), settings
+        )
     )
 
 

@@ -135,9 +135,7 @@ class PhysicsScene:
             )
         else:
             shared = 0
-            run = self._simulator.execute_turn(
-                task, turn.plan, turn.seed, length, on_step, sight=turn.sight
-            )
+            run = self._simulator.execute_turn(task, turn.plan, turn.seed, length, on_step, sight=turn.sight)
             judgement = judge(task, self._simulator.facts)
         prefix.check(run.steps[:length], run.prefix_digest)
         return Completed(
