@@ -7,6 +7,7 @@ from tests.fakes.worker import completed
 from embomatrix.manager.control.reputation import Auditor, AuditRules, Reputation, judge, opinion_of
 from embomatrix.manager.runtime.serialization import reputation_of, reputation_row
 from embomatrix.reward.breakdown import AtomResult
+from embomatrix.skills.turns import TurnObservation
 
 SAME = {"platform": "a1", "pybullet": "3.2.7"}
 OTHER = {"platform": "b2", "pybullet": "3.2.7"}
@@ -24,6 +25,22 @@ def test_traces_are_compared_within_a_platform_and_facts_across_platforms():
     assert not opinion().agrees(opinion("w2", OTHER, reward=better))
     richer = replace(completed().reward, goal=30.0)
     assert not opinion().agrees(opinion("w2", OTHER, reward=richer))
+
+
+def test_observations_of_turns_are_compared_within_a_platform():
+    seen = TurnObservation("kitchen_0", ("cup_1",), ("cup_1: in the robot's hand",), looked=True, sees=(1, 4))
+    invented = replace(seen, sees=(1, 2, 4))
+    honest = opinion(observation=seen)
+    assert honest.agrees(opinion("w2", observation=seen))
+    assert not honest.agrees(opinion("w2", observation=invented))
+    assert not honest.agrees(opinion("w2", observation=replace(seen, room="bath_0")))
+    assert honest.agrees(opinion("w2", OTHER, observation=invented))
+    padded = replace(seen, changes=("x" * 4_000,) * 3)
+    assert not honest.agrees(opinion("w2", OTHER, observation=padded))
+    assert judge([honest, opinion("w2", observation=invented), opinion("w3", observation=seen)]) == (
+        (0, 2),
+        (1,),
+    )
 
 
 def test_workers_without_a_fingerprint_are_compared_by_facts():

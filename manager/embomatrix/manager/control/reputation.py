@@ -52,8 +52,8 @@ class Opinion:
     worker_id: str
     platform: Mapping[str, str]
     """Versions of the worker. Without a platform fingerprint among them, ``trace`` is not compared."""
-    trace: tuple[str, float, float, float]
-    """Digest of the trace, and the exact three tiers of the reward."""
+    trace: tuple[str, str, float, float, float]
+    """Digests of the trace and of a turn's observation, and the exact three tiers of the reward."""
     facts: str
     """Digest of atoms, success, step failures and the rounded reward."""
     chars: int = 0
@@ -78,9 +78,17 @@ def opinion_of(worker_id: str, platform: Mapping[str, str], completed: Completed
         [step.failure for step in completed.steps],
         [round(tier, REWARD_DIGITS) for tier in tiers],
     )
-    digest = hashlib.blake2b(repr(facts).encode(), digest_size=16).hexdigest()
-    texts = (*completed.final, *(text for step in completed.steps for text in (step.message, step.blocker)))
-    return Opinion(worker_id, platform, (completed.trace_digest, *tiers), digest, sum(map(len, texts)))
+    digest = _digest(facts)
+    texts = [*completed.final, *(text for step in completed.steps for text in (step.message, step.blocker))]
+    observation = completed.observation
+    if observation is not None:
+        texts += [observation.room, *observation.held, *observation.changes]
+    trace = (completed.trace_digest, _digest(observation), *tiers)
+    return Opinion(worker_id, platform, trace, digest, sum(map(len, texts)))
+
+
+def _digest(value: object) -> str:
+    return hashlib.blake2b(repr(value).encode(), digest_size=16).hexdigest()
 
 
 class AuditVerdict(NamedTuple):
