@@ -22,6 +22,7 @@ from embomatrix.trainer.eai.sanitise import sanitise_answer
 from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
 from embomatrix.trainer.evaluation.answers import _read as read_answers
 from embomatrix.trainer.evaluation.benchmark import IMPORT_REPORT, _rejected
+from embomatrix.trainer.evaluation.episodes import _texts
 from embomatrix.trainer.evaluation.table import read_row
 from embomatrix.trainer.lifecycle.checkpoint import SCHEMA, TrainingProgress, read_state, restore
 from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome, write_outcome
@@ -116,6 +117,10 @@ def _codec(data: bytes) -> object:
 
 def _answers(data: bytes) -> object:
     return read_answers(in_file("answers.jsonl", data))
+
+
+def _episode_texts(data: bytes) -> object:
+    return _texts(Answer("t", 0, text_of(data)))
 
 
 def _report_row(data: bytes) -> object:
@@ -239,6 +244,13 @@ def table() -> dict[str, Decoder]:
             lambda: (_answer_lines(),),
             frozenset({"trainer.evaluation.answers:_read", "trainer.evaluation.answers:_validate"}),
             mutate_json_lines,
+        ),
+        "answers of an episode": Decoder(
+            _episode_texts,
+            (TrainerError,),
+            lambda: (b'["move 3", "done"]', b"[" * 9_000, b"[1]"),
+            frozenset({"trainer.evaluation.episodes:_texts"}),
+            mutate_json,
         ),
         "row of a report": Decoder(
             _report_row,

@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from embomatrix.envs.rules import Visibility
 from embomatrix.envs.simulation import ClusterSimulation, Simulation
-from embomatrix.envs.turns import LocalSimulation
 from embomatrix.host.limits import usable_cores
 from embomatrix.skills.prompt import Codec
 from embomatrix.skills.syntax import MAX_STEPS
@@ -90,6 +89,8 @@ class Cluster:
     def simulation(self, bench: Benchmark) -> Simulation:
         """Simulation of episodes, in this process if there is no manager."""
         if not self.manager:
+            from embomatrix.envs.turns import LocalSimulation
+
             return LocalSimulation(bench.dataset)
         return ClusterSimulation(bench.dataset, self._connect())
 

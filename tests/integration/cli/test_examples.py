@@ -300,9 +300,18 @@ def test_python_example_names_nothing_that_is_missing(page: Path, block: str) ->
     imports = re.findall(r"^from (embomatrix[\w.]*) import \(?([^)]*?)(?:\)|$)", block, re.MULTILINE)
     assert imports or "import embomatrix" in block
     for module, names in imports:
-        path = next(ROOT.glob(f"*/{module.replace('.', '/')}.py"))
-        defined = {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, NAMED)}
-        assert set(re.findall(r"\w+", names)) <= defined, module
+        assert set(re.findall(r"\w+", names)) <= names_in(module), module
+
+
+def names_in(module: str) -> set[str]:
+    """Return what a module defines, or what the ``__init__`` of a package offers."""
+    place = module.replace(".", "/")
+    path = next(iter([*ROOT.glob(f"*/{place}.py"), *ROOT.glob(f"*/{place}/__init__.py")]))
+    nodes = [*ast.walk(ast.parse(path.read_text()))]
+    defined = {node.name for node in nodes if isinstance(node, NAMED)}
+    return defined | {
+        alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
 
 
 @pytest.mark.parametrize(

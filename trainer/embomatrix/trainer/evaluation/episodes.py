@@ -36,6 +36,7 @@ from embomatrix.trainer.evaluation.pictures import chosen_pictures
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.taxonomy import Cause, cause_of_trace
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
+from embomatrix.world.json_text import parse_json
 
 if TYPE_CHECKING:
     from embomatrix.envs.simulation import Simulation
@@ -354,7 +355,7 @@ class EpisodeExam:
 def _texts(answer: Answer) -> list[str]:
     """Return the answers of an episode. Raises TrainerError for another text."""
     try:
-        value = json.loads(answer.text)
+        value = parse_json(answer.text.encode("utf-8", errors="replace"))
     except ValueError:
         value = None
     if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
