@@ -12,7 +12,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 from pydantic import ValidationError
@@ -68,9 +68,6 @@ from embomatrix.trainer.policy.limits import (
 )
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import write_whole
-
-if TYPE_CHECKING:
-    pass
 
 DEFAULT_OUT: Final = Path("runs/eval")
 REPORTS: Final = ("report.json", "report.txt", "report.html")

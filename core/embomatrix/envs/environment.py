@@ -10,22 +10,20 @@ import threading
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
 
 from embomatrix.envs.player import EpisodePlayer, Observation
 from embomatrix.envs.rules import EpisodeRules, Visibility, member
 from embomatrix.skills.prompt import Codec, Prompt, situation_of
-from embomatrix.starter.shipped import unpacked_tasks
+from embomatrix.starter.shipped import STARTER, unpacked_tasks
 from embomatrix.world.dataset import SPLITS, Dataset, DatasetError
 
 if TYPE_CHECKING:
     from embomatrix.envs.simulation import Simulation
     from embomatrix.world.dataset import TaskRecord
 
-STARTER: Final = "starter"
-"""Name of the shipped dataset."""
 T = TypeVar("T")
 
 

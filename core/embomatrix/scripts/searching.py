@@ -96,6 +96,12 @@ class SearchingScript:
         self._missing_before = len(categories)
         self._again = False
 
+    @classmethod
+    def of(cls, plan: Plan, situation: Situation, priors: PlacePriors) -> SearchingScript:
+        """Script for a plan of a task with this whole situation."""
+        used = {index for call in plan for index in (call.object_index, call.source_index)}
+        return cls(plan, {row.index: row.category for row in situation.rows if row.index in used}, priors)
+
     def next_call(self, known: Situation, last: Step | None) -> SkillCall | None:
         """Return the next call; None if the plan is done, or there is nowhere left to look.
 

@@ -27,6 +27,8 @@ from embomatrix.world.json_text import parse_json
 
 SHIPPED: Final = "shipped"
 """Name of the shipped policy, where a command takes a policy."""
+STARTER: Final = "starter"
+"""Name of the starter dataset where a folder or a benchmark is asked for."""
 VERIFIED_FILE: Final = "internal-verified-2.json"
 _POLICY: Final = "policy"
 

@@ -64,12 +64,13 @@ def _talk(
     folder: Path, priors: PlacePriors, form: ConversationForm, records: Sequence[TaskRecord]
 ) -> list[Row]:
     """Play the tasks of one bundle."""
-    dataset = Dataset(folder, ())
-    scene = dataset.read_bundle(records[0].bundle_digest).scene
+    bundle = Dataset(folder, ()).read_bundle(records[0].bundle_digest)
     rows = []
-    with LocalEpisodes(dataset.read_bundle) as episodes:
+    with LocalEpisodes(lambda _digest: bundle) as episodes:
         for record in records:
-            played = asyncio.run(play_search(episodes, scene, record, priors, form.visibility, form.codec))
+            played = asyncio.run(
+                play_search(episodes, bundle.scene, record, priors, form.visibility, form.codec)
+            )
             if played.player.reward.tiers.success:
                 rows.append(_row(record, played, form))
     return rows

@@ -78,16 +78,17 @@ def search_tasks(
 def _search_bundle(
     folder: Path, priors: PlacePriors, records: Sequence[TaskRecord]
 ) -> dict[str, SearchResult]:
-    with LocalEpisodes(Dataset(folder, ()).read_bundle) as episodes:
+    bundle = Dataset(folder, ()).read_bundle(records[0].bundle_digest)
+    with LocalEpisodes(lambda _digest: bundle) as episodes:
         return {
-            record.task.task_id: asyncio.run(_search(folder, episodes, record, priors)) for record in records
+            record.task.task_id: asyncio.run(_search(episodes, bundle.scene, record, priors))
+            for record in records
         }
 
 
 async def _search(
-    folder: Path, episodes: LocalEpisodes, record: TaskRecord, priors: PlacePriors
+    episodes: LocalEpisodes, scene: Scene, record: TaskRecord, priors: PlacePriors
 ) -> SearchResult:
-    scene = Dataset(folder, ()).read_bundle(record.bundle_digest).scene
     played = await play_search(episodes, scene, record, priors)
     return SearchResult(played.hidden, played.player.reward.tiers.success, played.player.reward.calls)
 
@@ -117,9 +118,7 @@ async def play_search(
     """Play an episode of a task with the searching script, within the budget of a search."""
     situation, plan = situation_of(scene, record.task), oracle_plan(record)
     used = {index for call in plan for index in (call.object_index, call.source_index)}
-    script = SearchingScript(
-        plan, {row.index: row.category for row in situation.rows if row.index in used}, priors
-    )
+    script = SearchingScript.of(plan, situation, priors)
     budget = min(MAX_STEPS, CALLS_FACTOR * len(plan) + CALLS_MORE)
     sight = visibility is Visibility.SEEN
     running = episodes.begin(record.bundle_digest, record.task.task_id, sight=sight)

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-from embomatrix.starter.shipped import frozen_digest, frozen_tasks, unpacked_tasks, verified_file
+from embomatrix.starter.shipped import STARTER, frozen_digest, frozen_tasks, unpacked_tasks, verified_file
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import TrainingTask, read_tasks
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, record_to_json
@@ -23,8 +23,6 @@ NAMED: Final[Mapping[str, tuple[Path, str]]] = {
     "eai": (Path("build/eai"), "embomatrix factory import"),
 }
 """Benchmarks that a command creates, with their folders."""
-STARTER: Final = "starter"
-"""Dataset that ships with the package."""
 VERIFIED: Final = "internal-verified-2"
 """Benchmark that ships with the package: the hardest held-out tasks of the corpus."""
 

@@ -273,9 +273,7 @@ class SearchingSubject:
     """Oracle: it knows what to do and with which objects, and looks for those that it has not seen."""
 
     def __init__(self, task: TrainingTask, priors: PlacePriors) -> None:
-        used = {index for call in task.oracle for index in (call.object_index, call.source_index)}
-        categories = {row.index: row.category for row in task.situation.rows if row.index in used}
-        self._script = SearchingScript(task.oracle, categories, priors)
+        self._script = SearchingScript.of(task.oracle, task.situation, priors)
 
     async def answer(
         self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
