@@ -7,6 +7,7 @@ from tests.fakes.real_cluster import RealCluster, connected
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.envs import EpisodeEnd, EpisodeRules, Visibility, make
+from embomatrix.reward.settings import RewardSettings
 from embomatrix.skills.episode_text import FORMAT
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import DatasetError, TaskRecord, write_dataset
@@ -73,6 +74,13 @@ def test_closed_container_shows_its_contents_once_it_is_open(dataset):
         assert f"New: chicken leg {leg}" in opened.text
         assert environment.step(f"close {fridge}").end is None
         assert environment.step("done").end is EpisodeEnd.DONE
+
+
+def test_coefficients_of_the_reward_may_be_chosen(dataset):
+    with make(dataset, reward=RewardSettings(unparsable=-3, format=2)) as environment:
+        environment.reset(environment.task_ids[0], seed=0)
+        assert environment.step("hm").reward.total == -3
+        assert environment.step("turn 1").reward.total == 2
 
 
 def test_many_episodes_are_played_side_by_side(dataset):

@@ -1,6 +1,7 @@
 """Adapters of other trainers on a real cluster: a manager, a worker with physics, and the examples in docs/."""
 
 import json
+import re
 
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
@@ -27,6 +28,38 @@ tokenizer.save_pretrained(sys.argv[1])
 LlamaForCausalLM(LlamaConfig(
     vocab_size=len(words), hidden_size=32, intermediate_size=64, num_hidden_layers=1, num_attention_heads=4,
     bos_token_id=0, eos_token_id=0, pad_token_id=0,
+)).save_pretrained(sys.argv[1])
+"""
+TOOL_CALLER = r"""
+import json
+import sys
+from pathlib import Path
+
+import trl
+from tokenizers import AddedToken, Tokenizer, decoders
+from tokenizers.models import WordLevel
+from tokenizers.pre_tokenizers import WhitespaceSplit
+from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
+
+# A model without any training calls tools, because each call is one token.
+calls = [
+    "<tool_call>\n" + json.dumps({"name": name, "arguments": {"object_index": row}}) + "\n</tool_call>"
+    for name in ("move", "open", "pick_up") for row in range(4)
+]
+words = ["<|im_end|>", "<unknown>", "<|im_start|>", *calls]
+inner = Tokenizer(WordLevel({word: at for at, word in enumerate(words)}, unk_token="<unknown>"))
+inner.pre_tokenizer = WhitespaceSplit()
+inner.add_special_tokens(["<|im_start|>", "<|im_end|>"])
+inner.add_tokens([AddedToken(call, normalized=False) for call in calls])
+inner.decoder = decoders.Fuse()
+tokenizer = PreTrainedTokenizerFast(
+    tokenizer_object=inner, eos_token="<|im_end|>", pad_token="<|im_end|>", unk_token="<unknown>",
+    chat_template=(Path(trl.__file__).parent / "chat_templates" / "qwen3.jinja").read_text(),
+)
+tokenizer.save_pretrained(sys.argv[1])
+LlamaForCausalLM(LlamaConfig(
+    vocab_size=len(words), hidden_size=32, intermediate_size=64, num_hidden_layers=1, num_attention_heads=4,
+    bos_token_id=0, eos_token_id=0, pad_token_id=0, max_position_embeddings=4096,
 )).save_pretrained(sys.argv[1])
 """
 
@@ -71,6 +104,30 @@ async def test_trl_trains_on_the_cluster_and_announces_the_next_scenes(cluster, 
     assert run.stats.prewarm_hits + run.stats.prewarm_misses > 0, "nothing was announced"
 
 
+async def test_trl_trains_in_episodes_on_the_cluster(cluster, dataset, tmp_path):
+    started, client = cluster
+    peer = Peer("trl", TORCH, "trl==1.16.0")
+    peer.run("-c", TOOL_CALLER, tmp_path / "model")
+    peer.run(
+        EXAMPLES / "train_with_trl_episodes.py",
+        *(dataset, tmp_path / "model", tmp_path / "out"),
+        *("--steps=3", "--group=4", "--calls=4", "--tokens=1500", "--cpu"),
+        EMBOMATRIX_MANAGER=started.address,
+    )
+    state = json.loads((tmp_path / "out" / "trainer_state.json").read_text())
+    steps = [entry for entry in state["log_history"] if "reward" in entry]
+    assert len(steps) == 3
+    for step in steps:
+        assert step["embomatrix/lost"] == 0
+        assert step["tools/failure_frequency"] == 0, "TRL could not call the tools"
+        assert step["embomatrix/calls"] > 0
+        tiers = sum(step[f"embomatrix/{tier}"] for tier in ("format", "relevance", "goal"))
+        assert step["reward"] == pytest.approx(tiers, abs=1e-4)
+    assert any(step["embomatrix/relevance"] > 0 for step in steps)
+    (run,) = [run for run in await client.list_runs(closed=True) if run.name == "episodes"]
+    assert run.closed_s, "the script's end closes its run"
+
+
 TRL = """
 import sys
 block = sys.argv[1]
@@ -81,19 +138,40 @@ print("trained", trainer.state.global_step)
 TRL_SETTINGS = "max_steps=1, per_device_train_batch_size=4, num_generations=2, report_to='none', use_cpu=True, bf16=False"
 
 
-async def test_trl_block_of_the_page_trains(cluster, dataset, tmp_path):
+@pytest.mark.parametrize(
+    ("heading", "model", "tokens"),
+    [("TRL", SMALL_MODEL, ("=1024", "=6")), ("TRL, in episodes", TOOL_CALLER, ("=8192", "=1500"))],
+)
+async def test_trl_block_of_the_page_trains(cluster, dataset, tmp_path, heading, model, tokens):
     peer = Peer("trl", TORCH, "trl==1.16.0")
-    peer.run("-c", SMALL_MODEL, tmp_path / "model")
-    (block,) = snippets("adapters.md", "TRL", "python")
+    peer.run("-c", model, tmp_path / "model")
+    (block,) = snippets("adapters.md", heading, "python")
     for printed, given in (
         ("model=...", f"model={str(tmp_path / 'model')!r}"),
         ("GRPOConfig(...", f"GRPOConfig(output_dir={str(tmp_path / 'out')!r}, {TRL_SETTINGS}"),
-        ("max_completion_length=1024", "max_completion_length=6"),  # seconds, not minutes
+        (f"max_completion_length{tokens[0]}", f"max_completion_length{tokens[1]}"),  # seconds, not minutes
         ("build/dataset", str(dataset)),
     ):
         assert printed in block
         block = block.replace(printed, given)
     assert "trained 1" in peer.run("-c", TRL, block, EMBOMATRIX_MANAGER=cluster[0].address)
+
+
+async def test_trl_block_of_the_readme_trains(cluster, dataset, tmp_path):
+    peer = Peer("trl", TORCH, "trl==1.16.0")
+    peer.run("-c", TOOL_CALLER, tmp_path / "model")
+    readme = (EXAMPLES.parents[1] / "README.md").read_text(encoding="utf-8")
+    (block,) = [each for each in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "trl" in each]
+    for printed, given in (
+        ("Qwen/Qwen3-1.7B", str(tmp_path / "model")),
+        ('GRPOConfig("runs/trl"', f"GRPOConfig({str(tmp_path / 'out')!r}, {TRL_SETTINGS}"),
+        ("max_completion_length=8192", "max_completion_length=1500"),
+        ("build/dataset", str(dataset)),
+    ):
+        assert printed in block
+        block = block.replace(printed, given)
+    printed = peer.run("-c", "import sys; exec(sys.argv[1])", block, EMBOMATRIX_MANAGER=cluster[0].address)
+    assert "embomatrix/success" in printed
 
 
 VERIFIERS = """

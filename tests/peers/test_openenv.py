@@ -30,8 +30,9 @@ for record in Dataset.load(sys.argv[1]).train:
         done = client.step({"text": json.dumps([dict(call) for call in record.oracle])})
         state = client.state()
         print(json.dumps({
-            "task": first.observation["task"], "none": none.reward, "unknown": unknown.observation["messages"],
-            "unchanged": unknown.observation["state"] == first.observation["state"], "total": unknown.reward + done.reward,
+            "task": first.observation["text"], "none": none.reward, "unknown": unknown.observation["messages"],
+            "told": [none.observation["text"], done.observation["text"]], "end": done.observation["end"],
+            "total": none.reward + unknown.reward + done.reward, "failed": state["failed_calls"],
             "done": done.done, "success": state["success"], "tiers": state["format"] + state["relevance"] + state["goal"],
         }))
 """
@@ -49,7 +50,10 @@ def test_plans_go_through_openenv_s_server_and_come_back_scored(tmp_path):
     assert len(rows) == 3
     for each in rows:
         assert "Task: " in each["task"]
-        assert (each["none"], each["unchanged"], each["done"], each["success"]) == (-1, True, True, True)
+        assert (each["none"], each["done"], each["end"], each["success"]) == (-1, True, "goal", True)
+        assert each["failed"] == 2
+        assert each["told"][0].startswith("Not an action: ")
+        assert "Robot: " in each["told"][1]
         assert len(each["unknown"]) == 1
         assert each["total"] == pytest.approx(each["tiers"])
         assert each["total"] > 30

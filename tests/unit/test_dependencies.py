@@ -33,6 +33,7 @@ HOSTS = {
     "bddl": "the source of the catalog tables, and EAI's judge",
     "datasets": "comes with TRL",
     "gymnasium": "the user's library, for envs.gym",
+    "inspect_ai": "the user's library, for envs.inspect_ai",
     "openenv": "the user's library, for envs.openenv",
     "trackio": "experiment tracker of the user",
     "trl": "the user's library, for the adapter",

@@ -113,7 +113,7 @@ def evaluate(
             _BENCH,
             "--bench",
             "--dataset",
-            help="starter, internal-verified-2, eai-native, eai, the folder of a dataset, or a file of task records. "
+            help="starter, internal-verified-2, search, eai-native, eai, the folder of a dataset, or a file of task records. "
             f"Default: ${DATASET_VARIABLE}, or {DEFAULT_DATASET}.",
         ),
     ] = "",
@@ -163,10 +163,9 @@ def evaluate(
         label = model or model_name or str(baseline)
         if settings.visibility is Visibility.SEEN and not settings.interactive:
             raise TrainerError("--visibility seen is for episodes: pass --interactive, or leave it out")
-        if settings.interactive and (model or bench == NATIVE):
+        if settings.interactive and bench == NATIVE:
             raise TrainerError(
-                "--interactive plays endpoints and baselines on our own tasks: serve a model with an OpenAI-compatible server "
-                "and pass --endpoint"
+                f"{NATIVE} judges whole plans: leave out --interactive, or pass another --bench"
             )
         opened = functools.partial(world_exam, cluster, interactive=settings.interactive)
         with _exam(opened, bench or str(default_dataset()), split, settings.tasks, settings.profile) as exam:

@@ -72,11 +72,17 @@ def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
         raise TrainerError(
             f"{model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
         )
-    ask, ruler = functools.partial(ask_policy, policy), Ruler.of_policy(policy)
+    ruler = Ruler.of_policy(policy)
     prompts = {each.task_id: each.prompt for each in exam.questions(policy.codec, trained.prompt.rows)}
     max_tokens = settings.max_tokens or room_for(trained.grpo.max_new, prompts, ruler)
     check_context(prompts, max_tokens, ruler, MAX_TOKENS)
-    return Subject(ask, policy.codec, trained.prompt.rows, max_tokens, ruler)
+    rows = trained.prompt.rows
+    if isinstance(exam, EpisodeExam):
+        from embomatrix.trainer.evaluation.replanning import ask_policy_in_episodes
+
+        playing = functools.partial(ask_policy_in_episodes, policy, rows, exam.stage)
+        return Subject(playing, Codec.LINES, rows, max_tokens, ruler)
+    return Subject(functools.partial(ask_policy, policy), policy.codec, rows, max_tokens, ruler)
 
 
 def endpoint_subject(

@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.markup import escape as without_markup
 from rich.table import Table
 
-from embomatrix.cli.plan_text import plan_with_names, rows_for_names
+from embomatrix.cli.plan_text import doubtful_angles, plan_with_names, rows_for_names
 from embomatrix.cli.play_by_hand import explore_by_hand, play_by_hand
-from embomatrix.envs.environment import make
 from embomatrix.envs.episode import Episode
+from embomatrix.envs.opening import make
 from embomatrix.envs.rules import EpisodeRules, Visibility
 from embomatrix.factory.commands.terminal import counter, fail, user_errors
 from embomatrix.host.own_files import prepare_output
@@ -166,10 +166,12 @@ def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: str | None, s
 
 
 def _plan_of_person(text: str, task: Task) -> Plan:
-    """Parse a text, and print lines that are no calls, and whether names were read. Raises PlanError."""
+    """Parse a text. Print lines that are no calls, doubtful angles, and whether names were read. Raises PlanError."""
     for line in prose_lines(rows_for_names(text, task.table), task.profile)[:MAX_STEPS]:
         console.print(f"[yellow]![/yellow] not a call, and passed over: {escape(line)}")
     plan = plan_with_names(text, task)
+    for doubt in doubtful_angles(plan):
+        console.print(f"[yellow]![/yellow] {escape(doubt)}")
     if rows_for_names(text, task.table) != text:
         console.print("names of objects were read as rows; the cluster reads rows only\n", style="dim")
     return plan

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Final
 
-from embomatrix.cli.plan_text import plan_with_names
+from embomatrix.cli.plan_text import doubtful_angles, plan_with_names
 from embomatrix.envs.environment import Environment
 from embomatrix.envs.episode import Episode
 from embomatrix.envs.rules import EpisodeReward
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.parse import PlanError, PlanReason
-from embomatrix.skills.prompt import Codec, prompt_for
-from embomatrix.skills.syntax import MAX_STEPS, PROFILES, SIGNATURES, Plan, Skill, SkillCall
+from embomatrix.skills.prompt import Codec, prompt_for, skill_line
+from embomatrix.skills.syntax import MAX_STEPS, PROFILES, Plan, SkillCall
 from embomatrix.world.task import Task
 
 HELP: Final = (
@@ -39,7 +39,7 @@ def play_by_hand(
         if words == ["state"]:
             show("\n".join(episode.state()))
         elif words == ["help"]:
-            show("\n".join([HELP, *map(signature, PROFILES[episode.task.profile])]))
+            show("\n".join([HELP, *map(skill_line, PROFILES[episode.task.profile])]))
         elif words == ["restart"]:
             episode.reset(seed)
             reward = None
@@ -56,6 +56,8 @@ def play_by_hand(
             if outcome.step.ok:
                 done.append(call)
             show(f"{'✓' if outcome.step.ok else '✗'} {outcome.step.message}")
+            for doubt in doubtful_angles([call]):
+                show(doubt)
             if reward.success:
                 show("the goal is reached")
                 break
@@ -82,22 +84,19 @@ def explore_by_hand(
     player = episode.player
     while (line := read()) is not None and (words := line.split()) != ["quit"]:
         if words == ["help"]:
-            show("\n".join([EXPLORING, *map(signature, PROFILES[player.observer.situation.profile])]))
+            show("\n".join([EXPLORING, *map(skill_line, PROFILES[player.observer.situation.profile])]))
         elif words == ["state"]:
             rooms = ", ".join(player.observer.situation.home)
             show(f"Rooms: {rooms}\n{prompt_for(player.observer.situation, Codec.LINES).user}")
         elif words:
             (observation,) = environment.answer([episode], [line])
             show(observation.text)
+            for doubt in doubtful_angles(step.call for step in observation.steps):
+                show(doubt)
             if observation.end is not None:
                 show(f"the episode is over: {observation.end}")
                 break
     return player.reward if any(step.ok for step in player.steps) else None
-
-
-def signature(skill: Skill) -> str:
-    """Return a skill with its arguments, ``place object_index relation``."""
-    return " ".join([skill.value, *(argument.value for argument in SIGNATURES[skill])])
 
 
 def call_in(line: str, task: Task) -> SkillCall:

@@ -1,6 +1,7 @@
 """Episodes in Python: ``make`` opens an environment over the tasks of a dataset."""
 
-from embomatrix.envs.environment import Environment, PlayedEpisode, make
+from embomatrix.envs.environment import Environment, PlayedEpisode
+from embomatrix.envs.opening import make
 from embomatrix.envs.player import Observation
 from embomatrix.envs.rules import EpisodeEnd, EpisodeReward, EpisodeRules, Visibility
 

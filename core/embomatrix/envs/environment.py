@@ -1,4 +1,4 @@
-"""The front door to episodes in Python: tasks of a dataset, played by answers in words, here or on a cluster.
+"""Episodes of a dataset's tasks, played by answers in words.
 
 A thread of its own runs the event loop, so the calls can be used in scripts, notebooks and threads of a trainer alike.
 """
@@ -6,18 +6,17 @@ A thread of its own runs the event loop, so the calls can be used in scripts, no
 from __future__ import annotations
 
 import asyncio
+import atexit
 import threading
 from collections.abc import Coroutine, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
 
 from embomatrix.envs.player import EpisodePlayer, Observation
-from embomatrix.envs.rules import EpisodeRules, Visibility, member
+from embomatrix.envs.rules import EpisodeRules, Visibility
 from embomatrix.skills.prompt import Codec, Prompt, situation_of
-from embomatrix.starter.shipped import STARTER, unpacked_tasks
 from embomatrix.world.dataset import SPLITS, Dataset, DatasetError
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ class PlayedEpisode:
 
 
 class Environment:
-    """Context manager over episodes of a dataset's tasks, any number side by side. ``make`` opens one.
+    """Context manager over episodes of a dataset's tasks, any number side by side. ``envs.make`` opens one.
 
     ``reset`` and ``step`` play one episode; ``begin`` and ``answer`` play many, whose turns are executed together.
     """
@@ -60,7 +59,8 @@ class Environment:
                 "with tasks"
             )
         self.rules = rules
-        self._dataset = dataset
+        self.dataset = dataset
+        """Tasks of all splits, and their scenes."""
         self._codec = codec
         self._simulation = simulation
         self._draws = np.random.default_rng(seed)
@@ -73,6 +73,8 @@ class Environment:
         except BaseException:
             self._end_loop()
             raise
+        # Scripts of trainers end without closing it, and a run on a cluster would stay open.
+        atexit.register(self.close)
 
     def __enter__(self) -> Self:
         return self
@@ -108,7 +110,7 @@ class Environment:
 
     def begin(self, tasks: Sequence[tuple[str, int]]) -> tuple[PlayedEpisode, ...]:
         """Begin an episode of each task, with its seed."""
-        records = [(self._dataset.find(task_id), seed) for task_id, seed in tasks]
+        records = [(self.dataset.find(task_id), seed) for task_id, seed in tasks]
         return self._wait(_all([self._begin(record, seed) for record, seed in records]))
 
     def answer(self, episodes: Sequence[PlayedEpisode], texts: Sequence[str]) -> tuple[Observation, ...]:
@@ -127,8 +129,17 @@ class Environment:
             _all([each.player.answer(text) for each, text in zip(episodes, texts, strict=True)])
         )
 
+    def announce(self, steps: Sequence[Sequence[str]], count: int) -> None:
+        """Say which tasks, by id, the coming steps play, with ``count`` episodes of each: a cluster loads their scenes by then.
+
+        Replaces what was announced before, and does not wait. Raises DatasetError for an unknown task.
+        """
+        records = [[self.dataset.find(task_id) for task_id in step] for step in steps]
+        asyncio.run_coroutine_threadsafe(self._simulation.announce(records, count), self._loop)
+
     def close(self) -> None:
         """Free the simulators, or close the run on the cluster."""
+        atexit.unregister(self.close)
         if self._thread.is_alive():
             try:
                 self._wait(self._simulation.close())
@@ -137,10 +148,10 @@ class Environment:
 
     async def _begin(self, record: TaskRecord, seed: int) -> PlayedEpisode:
         sight = self.rules.visibility is Visibility.SEEN
-        bundle = self._dataset.read_bundle(record.bundle_digest)
+        bundle = self.dataset.read_bundle(record.bundle_digest)
         situation = situation_of(bundle.scene, record.task)
         running = await self._simulation.begin(record, seed, sight=sight)
-        player = EpisodePlayer(running, situation, self.rules, self._codec)
+        player = EpisodePlayer(running, situation, self.rules, self._codec, self._simulation.reward)
         return PlayedEpisode(record.task.task_id, await player.begin(), player)
 
     def _wait(self, work: Coroutine[object, object, T]) -> T:
@@ -150,46 +161,6 @@ class Environment:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
-
-
-def make(
-    dataset: str | Path = STARTER,
-    *,
-    split: str = "heldout",
-    visibility: str | None = None,
-    rules: EpisodeRules | None = None,
-    codec: str = Codec.LINES,
-    manager: str = "",
-    token: str = "",
-    ca: bytes = b"",
-    seed: int = 0,
-) -> Environment:
-    """Open an environment over the tasks of a dataset: ``starter``, the shipped one, or a folder.
-
-    ``visibility`` is ``full`` or ``seen``, that of the ``rules`` if it is not given; ``codec`` is ``lines``, ``json`` or
-    ``names``. With the address of a ``manager``, turns are executed on its cluster, else in this process. ``seed`` draws tasks.
-
-    Raises ValueError for an unknown word, DatasetError for a missing dataset, ClusterError if the manager refuses.
-    """
-    known = EpisodeRules() if rules is None else rules
-    if visibility is not None:
-        known = replace(known, visibility=member(Visibility, "visibility", visibility))
-    form = member(Codec, "codec", codec)
-    loaded = Dataset.load(unpacked_tasks() if dataset == STARTER else dataset)
-    simulation = _simulation(loaded, manager, token, ca)
-    return Environment(loaded, split, known, form, simulation, seed)
-
-
-def _simulation(dataset: Dataset, address: str, token: str, ca: bytes) -> Simulation:
-    """Import what the place needs and nothing else: trainers have no simulator, and most scripts no gRPC."""
-    if not address:
-        from embomatrix.envs.turns import LocalSimulation
-
-        return LocalSimulation(dataset)
-    from embomatrix.envs.simulation import ClusterSimulation
-    from embomatrix.rpc.client import ClusterClient
-
-    return ClusterSimulation(dataset, lambda: ClusterClient(address, token, ca=ca))
 
 
 async def _all(work: Sequence[Coroutine[object, object, T]]) -> tuple[T, ...]:

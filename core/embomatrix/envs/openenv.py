@@ -1,4 +1,4 @@
-"""OpenEnv environment and server: an action is the text of a call or of a whole plan; each episode is one task.
+"""OpenEnv environment and server: an action is the text of an answer; each session plays one episode after another.
 
 Needs ``openenv``, which no other module needs. ``uvicorn.run(server("build/dataset"))`` serves it.
 """
@@ -20,52 +20,59 @@ except ModuleNotFoundError as error:
         name=error.name,
     ) from None
 
-from embomatrix.envs.episode import Episode, Household
-from embomatrix.reward.settings import PAPER
-from embomatrix.skills.parse import PlanError, parse_plan
+from embomatrix.envs.environment import Environment as Episodes
+from embomatrix.envs.environment import PlayedEpisode
+from embomatrix.envs.opening import make
+from embomatrix.envs.rules import EpisodeRules
+from embomatrix.skills.syntax import MAX_STEPS
 
 SESSIONS: Final = 4
-"""Concurrent episodes. Each has its own simulators, about 100 MB per scene."""
+"""Concurrent episodes."""
+RULES: Final = EpisodeRules(calls_per_answer=MAX_STEPS, ends_at_goal=True)
+"""Rules of episodes, if no others are given: an answer may be a call or a whole plan."""
 
 
-class PlanAction(Action):
-    """Calls in a plan's syntax, ``move 3`` or JSON, executed up to the first failure."""
+class AnswerAction(Action):
+    """Answer of the policy: calls as ``move 3`` or JSON, or ``done``."""
 
     text: str
 
 
 class HouseholdObservation(Observation):
-    """Prompt (``task``), one line per object (``state``) and the outcome of each call (``messages``)."""
+    """Text for the policy, and the outcome of each call of its answer (``messages``).
 
-    task: str
-    state: list[str]
+    ``end`` is the reason why the episode is over, empty while it goes on.
+    """
+
+    text: str
     messages: list[str] = []  # noqa: RUF012  # pydantic copies it
+    end: str = ""
 
 
 class HouseholdState(State):
-    """Task id and the tiers of the reward so far."""
+    """Task id, the tiers of the reward so far, and the calls."""
 
     task_id: str = ""
     success: bool = False
     format: float = 0.0
     relevance: float = 0.0
     goal: float = 0.0
+    failed_calls: int = 0
 
 
-class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, HouseholdState]):
-    """Tasks of a dataset. ``reset(seed=…)`` draws one, ``reset(task_id=…)`` names it.
+class HouseholdEnvironment(Environment[AnswerAction, HouseholdObservation, HouseholdState]):
+    """Tasks of a split. ``reset(seed=…)`` draws one, ``reset(task_id=…)`` names it.
 
-    The reward of a step is the gain of its calls; text that is not a plan changes nothing and gets −1. An episode is done at
-    the goal or after 64 calls.
+    The reward of a step is the change of the episode's reward, so its steps add up to that.
     """
 
     SUPPORTS_CONCURRENT_SESSIONS = True
 
-    def __init__(self, dataset: str | Path, split: str = "train") -> None:
+    def __init__(self, episodes: Episodes) -> None:
         super().__init__()
-        self._household = Household(dataset)
-        self._task_ids = [record.task.task_id for record in self._household.records if record.split == split]
-        self._episode: Episode | None = None
+        self._episodes = episodes
+        self._episode: PlayedEpisode | None = None
+        self._total = 0.0
         self._state = HouseholdState()
 
     def reset(
@@ -76,39 +83,38 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
         task_id: str = "",
         **_: Any,
     ) -> HouseholdObservation:
-        """Start an episode. Raises DatasetError for an unknown task."""
+        """Begin an episode. Raises DatasetError for an unknown task, and what executing a turn raises."""
         draw = np.random.default_rng(seed)
-        named = task_id or self._task_ids[int(draw.integers(len(self._task_ids)))]
-        self._episode = self._household.episode(named)
-        self._episode.reset(int(draw.integers(2**31)))
+        task_ids = self._episodes.task_ids
+        named = task_id or task_ids[int(draw.integers(len(task_ids)))]
+        (self._episode,) = self._episodes.begin([(named, int(draw.integers(2**31)))])
+        self._total = 0.0
         self._state = HouseholdState(episode_id=episode_id or uuid.uuid4().hex, step_count=0, task_id=named)
-        return self._observation(self._episode, 0.0, [], done=False)
+        prompt = self._episode.prompt
+        return HouseholdObservation(text=f"{prompt.system}\n\n{prompt.user}", reward=0.0, done=False)
 
-    def step(self, action: PlanAction, timeout_s: float | None = None, **_: Any) -> HouseholdObservation:
-        """Execute the calls of a text, up to the first that fails."""
+    def step(self, action: AnswerAction, timeout_s: float | None = None, **_: Any) -> HouseholdObservation:
+        """Take an answer. Raises RuntimeError before ``reset`` and after the end."""
         if self._episode is None:
             raise RuntimeError("no episode was begun: call reset first")
-        try:
-            plan = parse_plan(action.text, self._episode.task.profile)
-        except PlanError as error:
-            return self._observation(self._episode, PAPER.unparsable, [str(error)], done=False)
-        gain, messages, done = 0.0, [], False
-        for call in plan:
-            outcome = self._episode.act(call)
-            gain += outcome.gain
-            messages.append(outcome.step.message)
-            reward = outcome.reward
-            done = reward.success or outcome.over
-            self._state = self._state.model_copy(
-                update={
-                    "step_count": self._state.step_count + 1,
-                    "success": reward.success,
-                    **reward.tiers,
-                }
-            )
-            if done or not outcome.step.ok:
-                break
-        return self._observation(self._episode, gain, messages, done=done)
+        (observation,) = self._episodes.answer([self._episode], [action.text])
+        reward = observation.reward
+        gain, self._total = reward.total - self._total, reward.total
+        self._state = self._state.model_copy(
+            update={
+                "step_count": reward.calls,
+                "failed_calls": reward.failures,
+                "success": reward.tiers.success,
+                **reward.tiers.tiers,
+            }
+        )
+        return HouseholdObservation(
+            text=observation.text,
+            messages=[step.message for step in observation.steps],
+            end=observation.end or "",
+            reward=gain,
+            done=observation.end is not None,
+        )
 
     @property
     def state(self) -> HouseholdState:
@@ -116,25 +122,25 @@ class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, Househo
         return self._state
 
     def close(self) -> None:
-        """Free the simulators."""
-        self._household.close()
-
-    def _observation(
-        self, episode: Episode, gain: float, messages: list[str], *, done: bool
-    ) -> HouseholdObservation:
-        prompt = episode.prompt()
-        return HouseholdObservation(
-            task=f"{prompt.system}\n\n{prompt.user}",
-            state=list(episode.state()),
-            messages=messages,
-            reward=gain,
-            done=done,
-        )
+        """Give up the episode. The simulators serve other sessions too."""
+        self._episode = None
 
 
-def server(dataset: str | Path, split: str = "train", sessions: int = SESSIONS) -> Any:
-    """ASGI application with at most this many concurrent sessions."""
-    environment = functools.partial(HouseholdEnvironment, dataset, split)
+def server(
+    dataset: str | Path,
+    split: str = "train",
+    sessions: int = SESSIONS,
+    visibility: str | None = None,
+    rules: EpisodeRules = RULES,
+    **cluster: Any,
+) -> Any:
+    """ASGI application with at most this many concurrent sessions.
+
+    Episodes are executed in this process, or on the cluster that the arguments ``manager``, ``token`` and ``ca`` of
+    ``envs.make`` name. Raises what ``envs.make`` raises.
+    """
+    episodes = make(dataset, split=split, visibility=visibility, rules=rules, **cluster)
+    environment = functools.partial(HouseholdEnvironment, episodes)
     return create_app(
-        environment, PlanAction, HouseholdObservation, env_name="embomatrix", max_concurrent_envs=sessions
+        environment, AnswerAction, HouseholdObservation, env_name="embomatrix", max_concurrent_envs=sessions
     )

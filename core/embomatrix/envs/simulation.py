@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, Protocol
 
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.episodes import Episodes
+from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.wire.values import LookaheadEntry, RunTerms
 
 if TYPE_CHECKING:
+    from embomatrix.reward.settings import RewardSettings
     from embomatrix.reward.turns import RunningEpisode
     from embomatrix.rpc.client import ClusterClient
     from embomatrix.world.dataset import Dataset, TaskRecord
 
 RUN_NAME: Final = "episodes"
 
+logger = logging.getLogger(__name__)
+
 
 class Simulation(Protocol):
     """Executes episodes, any number side by side. Equal episodes have equal turns everywhere on one platform."""
 
+    reward: RewardSettings
+    """Coefficients of the reward."""
     scenes: int
     """Scenes to use at a time: with more, they would be loaded again and again."""
 
@@ -27,6 +36,12 @@ class Simulation(Protocol):
 
     async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
         """Begin an episode of a task."""
+
+    async def announce(self, steps: Sequence[Sequence[TaskRecord]], count: int) -> None:
+        """Say which tasks the coming steps play, ``count`` episodes of each, so that their scenes are loaded by then.
+
+        Replaces what was announced before.
+        """
 
     async def close(self) -> None:
         """Free the simulators, or close the run on the cluster."""
@@ -37,24 +52,46 @@ class ClusterSimulation:
 
     scenes = 32
 
-    def __init__(self, dataset: Dataset, connect: Callable[[], ClusterClient]) -> None:
+    def __init__(
+        self, dataset: Dataset, connect: Callable[[], ClusterClient], reward: RewardSettings = PAPER
+    ) -> None:
+        self.reward = reward
         self._dataset = dataset
         self._connect = connect
         self._stack = contextlib.AsyncExitStack()
         self._sent: set[str] = set()
+        self._announced = 0
 
     async def open(self) -> None:
         self._client = await self._stack.enter_async_context(self._connect())
-        run_id = await self._client.open_run(RUN_NAME)
-        self._stack.push_async_callback(self._client.close_run, run_id)
-        self._episodes = await self._stack.enter_async_context(Episodes(self._client, run_id))
+        self._run_id = await self._client.open_run(RUN_NAME, terms=RunTerms(reward=self.reward))
+        self._stack.push_async_callback(self._client.close_run, self._run_id)
+        self._episodes = await self._stack.enter_async_context(Episodes(self._client, self._run_id))
 
     async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
-        digest = record.bundle_digest
+        await self._send(record.bundle_digest)
+        return self._episodes.begin(record.bundle_digest, record.task.task_id, seed, sight=sight)
+
+    async def announce(self, steps: Sequence[Sequence[TaskRecord]], count: int) -> None:
+        """A rejection is only logged: the announcement is advice."""
+        self._announced += 1
+        version = self._announced
+        entries = [
+            LookaheadEntry(step, record.bundle_digest, count)
+            for step, records in enumerate(steps)
+            for record in records
+        ]
+        try:
+            for entry in entries:
+                await self._send(entry.bundle_digest)
+            await self._client.announce_lookahead(self._run_id, version, entries)
+        except ClusterError as error:
+            logger.warning("look-ahead rejected: %s", error)
+
+    async def _send(self, digest: str) -> None:
         if digest not in self._sent:
             await self._client.put_bundles({digest: self._dataset.bundle_bytes(digest)})
             self._sent.add(digest)
-        return self._episodes.begin(digest, record.task.task_id, seed, sight=sight)
 
     async def close(self) -> None:
         await self._stack.aclose()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
@@ -106,11 +106,15 @@ class LocalSimulation:
 
     scenes = SCENES_KEPT
 
-    def __init__(self, dataset: Dataset) -> None:
-        self._episodes = LocalEpisodes(dataset.read_bundle)
+    def __init__(self, dataset: Dataset, reward: RewardSettings = PAPER) -> None:
+        self.reward = reward
+        self._episodes = LocalEpisodes(dataset.read_bundle, reward)
 
     async def open(self) -> None:
         pass
+
+    async def announce(self, steps: Sequence[Sequence[TaskRecord]], count: int) -> None:
+        """Without effect: a scene is loaded with its first turn."""
 
     async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
         return self._episodes.begin(record.bundle_digest, record.task.task_id, seed, sight=sight)

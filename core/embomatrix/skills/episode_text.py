@@ -75,6 +75,15 @@ def opening(situation: Situation, codec: Codec, *, seen: bool, at_once: int) -> 
     return Prompt(_system(codec, situation.profile, seen=seen, at_once=at_once), rooms + prompt.user)
 
 
+def system_for_tools(profile: Profile, *, seen: bool) -> str:
+    """System text for a model that calls the skills as tools instead of writing them."""
+    return (
+        "You control a home robot step by step: call one tool at a time, and you are told what happened. "
+        f"When the task is fulfilled, answer {DONE} without a call. A failed call changes nothing.\n"
+        f"{RULES}{ADDED_RULES[profile]}{_SEEN if seen else ''}"
+    )
+
+
 def _system(codec: Codec, profile: Profile, *, seen: bool, at_once: int) -> str:
     call, end = EXAMPLES[codec]
     form = _FORMS[codec, at_once > 1].format(count=at_once)

@@ -281,12 +281,14 @@ EXAMPLES: Final[Mapping[Codec, str]] = {
 """Example plan in each codec: put the apple (row 4) into the fridge (row 2)."""
 
 
+def skill_line(skill: Skill) -> str:
+    """Skill with its arguments as a call on a line: ``turn radians``."""
+    return " ".join([skill.value, *(_PLACEHOLDERS[argument] for argument in SIGNATURES[skill])])
+
+
 def skill_lines(profile: Profile) -> str:
     """Skills of a profile with their arguments, as calls on lines."""
-    return " | ".join(
-        " ".join([skill.value, *(_PLACEHOLDERS[argument] for argument in SIGNATURES[skill])])
-        for skill in PROFILES[profile]
-    )
+    return " | ".join(map(skill_line, PROFILES[profile]))
 
 
 def skill_objects(profile: Profile) -> str:

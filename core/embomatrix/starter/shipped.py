@@ -5,8 +5,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -24,12 +24,20 @@ from embomatrix.world.dataset import (
     write_dataset,
 )
 from embomatrix.world.json_text import parse_json
+from embomatrix.world.whole_file import write_whole
 
 SHIPPED: Final = "shipped"
 """Name of the shipped policy, where a command takes a policy."""
 STARTER: Final = "starter"
 """Name of the starter dataset where a folder or a benchmark is asked for."""
-VERIFIED_FILE: Final = "internal-verified-2.json"
+VERIFIED: Final = "internal-verified-2"
+"""Name of the benchmark of the hardest held-out tasks."""
+SEARCH: Final = "search"
+"""Name of the dataset of those tasks of the corpus whose things must be searched for."""
+FROZEN: Final = (VERIFIED, SEARCH)
+"""Names of the lists of tasks that are frozen by id."""
+FROZEN_MARK: Final = b'"digest": "sha256:'
+"""Mark of a file of frozen tasks."""
 _POLICY: Final = "policy"
 
 
@@ -57,15 +65,25 @@ def unpack_part(folder: Path, part: int) -> None:
     write_dataset(folder, records, bundles)
 
 
-def unpack(folder: Path) -> str:
-    """Write the starter dataset to a folder and return the digest of its parts' digests.
+def dataset_named(named: str | Path) -> Dataset:
+    """Load the dataset in a folder, or a shipped one: ``starter``, ``search`` or ``internal-verified-2``.
 
     Raises DatasetError or OSError.
+    """
+    if named in FROZEN and not Path(named).exists():
+        return frozen_dataset(str(named))[0]
+    return Dataset.load(unpacked_tasks() if named == STARTER else named)
+
+
+def unpack(folder: Path, parts: Iterable[int] = STARTER_PARTS) -> str:
+    """Write shipped parts to a folder as one dataset, by default the starter dataset.
+
+    Return the digest of the parts' digests. Raises DatasetError or OSError.
     """
     everything: list[TaskRecord] = []
     bundles: dict[str, bytes] = {}
     digests = []
-    for part in STARTER_PARTS:
+    for part in parts:
         records, contents, digest = read_packed(archive_of(part))
         everything += records
         bundles |= contents
@@ -96,20 +114,52 @@ def dataset_folder(named: Path | None) -> Path:
     return folder if os.environ.get(DATASET_VARIABLE) or folder.exists() else unpacked_tasks()
 
 
-def verified_file() -> Path:
-    """Return the file of the tasks of Internal-Verified 2, which need not exist."""
-    return archive_of(1).with_name(VERIFIED_FILE)
+def frozen_file(named: str) -> Path:
+    """Return the file of one of the lists in ``FROZEN``, which need not exist."""
+    return archive_of(1).with_name(f"{named}.json")
+
+
+def frozen_dataset(named: str) -> tuple[Dataset, tuple[TaskRecord, ...]]:
+    """Return the tasks of one of the lists in ``FROZEN``, and all records that they were chosen from.
+
+    Raises DatasetError for a list that does not ship, and for tasks that are not the frozen ones; or OSError.
+    """
+    if not frozen_file(named).exists():
+        raise DatasetError(
+            f"{named} does not ship with this version: pass a dataset folder, or install a newer version"
+        )
+    frozen = frozen_tasks(frozen_file(named))
+    folder = unpacked_tasks(STARTER_PARTS if named == VERIFIED else shipped_parts())
+    records = Dataset.load(folder).records
+    ids = frozenset(frozen.tasks)
+    chosen = tuple(record for record in records if record.task.task_id in ids)
+    found = frozen_digest(chosen)
+    if found != frozen.digest:
+        raise DatasetError(
+            f"the tasks of {named} in {folder} have the digest {found}, expected {frozen.digest}: remove the folder, so "
+            "that the shipped tasks are unpacked again"
+        )
+    return Dataset(folder, chosen), records
 
 
 def frozen_tasks(path: Path) -> FrozenTasks:
-    """Return the tasks of a file that ``factory corpus --freeze`` wrote. Raises DatasetError."""
+    """Return the tasks of a file that ``freeze`` wrote. Raises DatasetError."""
     try:
         value = parse_json(path.read_bytes())
         return FrozenTasks(str(value["digest"]), tuple(map(str, value["tasks"])))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DatasetError(
-            f"{path} names no frozen tasks ({error}): write it again with `embomatrix factory corpus --freeze`"
+            f"{path} names no frozen tasks ({error}): write it again with `embomatrix factory corpus --freeze`, or "
+            "`factory search --freeze`"
         ) from error
+
+
+def freeze(records: Iterable[TaskRecord], file: Path) -> FrozenTasks:
+    """Write the ids of records to a file, with the digest of the records. Raises OSError."""
+    chosen = tuple(records)
+    frozen = FrozenTasks(frozen_digest(chosen), tuple(record.task.task_id for record in chosen))
+    write_whole(file, (json.dumps(asdict(frozen), indent=1) + "\n").encode("ascii"))
+    return frozen
 
 
 def frozen_digest(records: Iterable[TaskRecord]) -> str:
@@ -123,20 +173,20 @@ def shipped_policy() -> Path:
     return Path(str(resources.files("embomatrix.starter") / _POLICY))
 
 
-def unpacked_tasks() -> Path:
-    """Return the folder of the starter dataset in the user's cache, and unpack it there if it is missing.
+def unpacked_tasks(parts: Sequence[int] = STARTER_PARTS) -> Path:
+    """Return the folder of shipped parts in the user's cache, by default the starter dataset; unpack them if it is missing.
 
     Raise DatasetError or OSError.
     """
     hashed = hashlib.sha256()
-    for part in STARTER_PARTS:
+    for part in parts:
         hashed.update(archive_of(part).read_bytes())
     folder = _cache() / f"tasks-{hashed.hexdigest()[:12]}"
     if not (folder / TASKS_FILE).exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
         # Two commands may unpack at once; a command that is interrupted leaves no half dataset.
         with tempfile.TemporaryDirectory(dir=folder.parent) as fresh:
-            unpack(Path(fresh) / folder.name)
+            unpack(Path(fresh) / folder.name, parts)
             shutil.rmtree(folder, ignore_errors=True)
             try:
                 (Path(fresh) / folder.name).replace(folder)

@@ -38,7 +38,7 @@ FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 CHECKED = Counter(
     {
         # test_python_example_names_nothing_that_is_missing, and tests/peers with the libraries
-        ("adapters.md", "python"): 5,
+        ("adapters.md", "python"): 6,
         ("training.md", "python"): 1,  # test_lookahead_of_the_page_announces_coming_batches
         ("episodes.md", "python"): 3,  # tests/integration/test_episodes.py
         ("episodes.md", "text"): 1,
@@ -56,7 +56,7 @@ CHECKED = Counter(
         ("spare_pcs.md", "toml"): 1,
         ("spare_pcs.md", "xml"): 1,  # test_property_list_of_the_page_runs_a_worker
         ("operations.md", "json"): 1,  # test_log_line_of_the_page_has_the_fields_of_a_log_line
-        ("README.md", "python"): 1,  # tests/integration/test_episodes.py
+        ("README.md", "python"): 2,  # tests/integration/test_episodes.py, tests/peers/test_adapters.py
         ("README.md", "plan"): 1,  # test_plan_of_the_readme_earns_the_printed_reward
         ("README.md", "mermaid"): 1,  # `make diagrams`
         ("architecture.md", "mermaid"): 2,
@@ -69,6 +69,7 @@ NOT_COMMANDS = ("reward.custom_reward_function.", "--reward.remote_url", "reward
 """Beginnings of blocks without a language that are settings of other programs, or formulas."""
 ELSEWHERE = {
     r"^(make|pip|source|docker|PYTHONPATH=|ACCESS=)": "prepares the machine",
+    r"^inspect eval": "needs a model: tests/peers/test_inspect_ai.py",
     r"manager|worker|embomatrix (train|cluster|doctor|experiment|bench)|--llm|--endpoint": "needs a cluster or a model",
     r"HOST|URL|FOLDER|…|eai|--join": "has a placeholder, or needs a download",
     r"embomatrix eval|--policy|--answers": "judges 200 tasks, or needs a policy: tests/integration/cli/test_evaluate.py",

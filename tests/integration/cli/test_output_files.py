@@ -46,6 +46,7 @@ WRITERS = (
     "factory try one.bddl --page OUT",
     f"factory inspect {TASK} --dataset K --out OUT",
     "factory corpus --freeze OUT",
+    "factory search --dataset K --out picked --freeze OUT",
     "factory evaluate scenes --outcomes OUT",
     "factory evaluate aesthetics --calibration OUT",
     "factory evaluate lies --page OUT",

@@ -46,6 +46,7 @@ REFUSALS = (
     Refusal("factory difficulty --dataset OUT --out OUT/../OUT --easy-share 0.5", TASKS),
     Refusal("factory search --dataset K --out OUT", TASKS),
     Refusal("factory search --dataset OUT --out OUT/../OUT", TASKS),
+    Refusal("factory search --dataset K --out OUT/new --freeze OUT/frozen.json", "OUT/frozen.json"),
     Refusal("factory merge K K --out OUT", "OUT/notes.txt"),
     Refusal("factory corpus --out OUT", "OUT/tasks/notes.txt"),
     Refusal("factory corpus --part 1 --out OUT", "OUT/parts/1/tasks.jsonl"),

@@ -180,16 +180,19 @@ def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
 
 
 def test_task_is_played_by_hand_call_by_call(run):
-    typed = "pick_up apple_1\ndance 3\nhelp\npick_up aple_1\n"
+    typed = "pick_up apple_1\nturn 90\nturn 6\ndance 3\nhelp\npick_up aple_1\n"
     typed += "move apple_1\nstate\npick_up 10\nmove countertop_1\nplace 0 ontop\nmove 1\n"
     result = run("apple_to_counter", "--interactive", text=typed)
     assert result.exit_code == 0, result.output
     printed = " ".join(result.output.split())
     assert "✗ apple_1 is" in printed, "a failed call changes nothing"
     assert "unknown skill 'dance'" in printed
-    assert "move object_index" in printed, "`help` lists the calls"
+    assert "move object" in printed, "`help` lists the calls"
+    assert "turn radians" in printed
+    assert "turn by 90 radians, which is more than a full turn; 90 degrees are 1.57" in printed
     assert "did you mean apple_1" in printed
-    assert printed.endswith("for --plan FILE move 10 pick_up 10 move 0 place 0 ontop")
+    assert printed.count("full turn") == 1
+    assert printed.endswith("for --plan FILE turn 90.0 turn 6.0 move 10 pick_up 10 move 0 place 0 ontop")
     assert "✓ put apple_1 on top of countertop_1 the goal is reached" in printed
     assert "Reward" in printed
     assert "✓ stands at" not in printed.split("the goal is reached")[1], "the task ends at the goal"

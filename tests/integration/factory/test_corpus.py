@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from embomatrix.factory.commands.app import app
 from embomatrix.factory.pipeline.corpus import (
     TASKS,
-    freeze,
+    freeze_hardest,
     join_parts,
     joined_part,
     part_folder,
@@ -101,12 +101,12 @@ def test_the_hardest_held_out_tasks_are_frozen(parts):
         dataclasses.replace(record, difficulty=HARD if record.task.task_id in hard else EASY)
         for record in Dataset.load(parts / TASKS).records
     ]
-    frozen = freeze(records, 2, parts / "frozen.json")
+    frozen = freeze_hardest(records, 2, parts / "frozen.json")
     assert frozen.tasks == ("Ihlen_1_int-e", "Ihlen_1_int-f")
     assert frozen_tasks(parts / "frozen.json") == frozen
     assert frozen.digest == frozen_digest([r for r in records if r.task.task_id in frozen.tasks])
     with pytest.raises(DatasetError, match="found 3 held-out tasks to freeze: expected at least 4"):
-        freeze(records, 4, parts / "frozen.json")
+        freeze_hardest(records, 4, parts / "frozen.json")
 
 
 def test_a_frozen_digest_covers_goals_and_not_difficulties(parts):

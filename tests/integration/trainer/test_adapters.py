@@ -8,10 +8,11 @@ import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.reward_label import RewardLabel
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.adapters import openrlhf, rows, verl
-from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
+from embomatrix.trainer.adapters.scorer import PlanScorer, reward_named, scorer_for
 from embomatrix.trainer.adapters.trl import AnnouncedSampler, ClusterLookahead, ClusterReward, text_of
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import load_tasks
@@ -186,6 +187,27 @@ def until(condition, seconds=20.0):
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
+
+
+def test_coefficients_of_the_reward_come_from_a_text_or_the_variable(monkeypatch):
+    assert reward_named() == PAPER
+    assert reward_named(" goal=10, format=0 ") == RewardSettings(goal=10, format=0)
+    monkeypatch.setenv("EMBOMATRIX_REWARD", "goal=5")
+    assert reward_named() == RewardSettings(goal=5)
+    assert reward_named("goal=10").goal == 10, "an argument comes before the variable"
+    for wrong, sentence in (
+        ("gaol=5", "found 'gaol=5': expected NAME=NUMBER with one of the names unparsable, format,"),
+        ("goal", "found 'goal': expected NAME=NUMBER"),
+        ("goal=much", "found 'goal=much': expected NAME=NUMBER"),
+        ("goal=-1", r"goal: found -1: expected 0 or more"),
+    ):
+        with pytest.raises(TrainerError, match=sentence):
+            reward_named(wrong)
+
+
+async def test_scorer_counts_by_its_coefficients(cluster):
+    with scorer(cluster, reward=RewardSettings(unparsable=-2)) as opened:
+        assert (await opened.reward_of(FIRST.task.task_id, "hm")).total == -2
 
 
 async def test_verl_gets_the_same_keys_for_valid_and_invalid_plans(on_cluster):

@@ -10,10 +10,10 @@ from tests.fakes.chat_server import ChatServer, completion
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.executors import HereExecutor
 
-from embomatrix.factory.pipeline.corpus import freeze
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.starter.shipped import freeze
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.answer_sources import ask_endpoint, ask_script, questions_digest
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup, read_answers
@@ -25,7 +25,7 @@ from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
 from embomatrix.worker.slots.rollout_pool import RolloutPool
-from embomatrix.world.dataset import Dataset, write_dataset
+from embomatrix.world.dataset import Dataset
 from embomatrix.world.difficulty import Difficulty
 from embomatrix.world.task import Profile
 
@@ -127,25 +127,21 @@ def test_scripts_write_executable_plans_for_tasks_that_they_never_saw(bench, nam
 
 def test_frozen_tasks_are_found_by_name_once_they_ship(tmp_path, monkeypatch):
     folder = write_kitchen_dataset(tmp_path / "kitchen")
-    records = [replace(record, split="heldout") for record in Dataset.load(folder).records]
-    write_dataset(folder, records, {})
+    records = Dataset.load(folder).records
     file = tmp_path / "frozen.json"
-    module = "embomatrix.trainer.evaluation.benchmark"
-    monkeypatch.setattr(f"{module}.verified_file", lambda: file)
-    monkeypatch.setattr(f"{module}.unpacked_tasks", lambda: folder)
+    module = "embomatrix.starter.shipped"
+    monkeypatch.setattr(f"{module}.frozen_file", lambda _: file)
+    monkeypatch.setattr(f"{module}.unpacked_tasks", lambda *_: folder)
     with pytest.raises(TrainerError, match="does not ship with this version: pass a dataset folder"):
-        find_benchmark("internal-verified-2")
-    frozen = freeze(records, 2, file)
-    found = find_benchmark("internal-verified-2")
+        find_benchmark("search")
+    frozen = freeze(records[:2], file)
+    found = find_benchmark("search", "train")
     assert tuple(record.task.task_id for record in found.records) == frozen.tasks
-    assert found.training.records == tuple(records)
-    with pytest.raises(
-        TrainerError, match="all tasks of internal-verified-2 are held out, found --split train"
-    ):
-        find_benchmark("internal-verified-2", "train")
+    assert found.training.records == records
+    with pytest.raises(TrainerError, match="search has no tasks in the split 'heldout': it has train"):
+        find_benchmark("search", "heldout")
     other = replace(records[0].task, instruction="Do something else.")
-    changed = [replace(records[0], task=other), *records[1:]]
-    freeze(changed, len(changed), file)
+    freeze([replace(records[0], task=other), *records[1:]], file)
     with pytest.raises(
         TrainerError, match=r"have the digest sha256:.*, expected sha256:.*: remove the folder"
     ):

@@ -12,8 +12,11 @@ from tests.integration.cli.test_evaluate import run_evaluation
 from embomatrix.envs.turns import LocalSimulation
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.scripts.searching import PlacePriors
+from embomatrix.skills.parse import parse_plan
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.episodes import (
@@ -24,8 +27,11 @@ from embomatrix.trainer.evaluation.episodes import (
     play_episodes,
 )
 from embomatrix.trainer.evaluation.page import evaluation_page
+from embomatrix.trainer.evaluation.replanning import ReplanningSubject, WrittenPlan
 from embomatrix.trainer.evaluation.table import report_of, text_report
 from embomatrix.trainer.evaluation.taxonomy import Cause
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
+from embomatrix.trainer.policy.loading import new_policy
 
 APPLE = "apple_to_counter"
 SOLVED = ("move 10", "pick_up 10", "move 0", "place 0 ontop", "done")
@@ -172,6 +178,82 @@ def test_answers_of_plans_are_no_episodes(apple, text):
         judged(apple, [Answer(APPLE, 0, text)], setup_of(apple))
 
 
+def plans_of(task, *texts):
+    """Return a writer of these plans, None for a text without one, and the list of what it is asked with."""
+    plans, asked = iter(texts), []
+
+    def write(situation, number):
+        asked.append(situation)
+        text = next(plans)
+        return WrittenPlan(None if text is None else parse_plan(text), 5)
+
+    return write, asked
+
+
+def replanned(apple, folder, setup, *texts):
+    write, asked = plans_of(apple.tasks[APPLE], *texts)
+    exam = exam_of(apple)
+    with AnswerSheet(folder / "answers.jsonl", setup) as sheet:
+        play_episodes(
+            exam.stage,
+            lambda *_: ReplanningSubject(write),
+            exam.questions(Codec.LINES, 60),
+            sheet,
+            lambda *_: None,
+        )
+        return sheet.ordered(exam.task_ids), asked
+
+
+def test_policy_writes_another_plan_after_a_failed_call(apple, tmp_path):
+    setup = setup_of(apple)
+    plans = ("move 10\npick_up 10\nplace 0 ontop\nmove 0", "move 0\nplace 0 ontop")
+    answers, asked = replanned(apple, tmp_path, setup, *plans)
+    assert len(asked) == 2
+    assert asked[1].held == ("apple_1",), "the second plan begins in the state reached"
+    assert json.loads(answers[0].text) == [
+        *("move 10", "pick_up 10", "place 0 ontop", "move 0", "place 0 ontop", "done")
+    ]
+    assert answers[0].completion_tokens == 10
+    assert judged(apple, answers, setup)[0]["overall"]["success"]["value"] == 1.0
+
+
+def test_text_without_a_plan_counts_as_a_failed_call_and_another_plan_follows(apple, tmp_path):
+    answers, asked = replanned(apple, tmp_path, setup_of(apple), None, "move 10", None)
+    assert json.loads(answers[0].text) == ["no plan", "move 10", "done"]
+    assert len(asked) == 2
+
+
+def test_policy_writes_another_plan_when_the_robot_has_seen_something_new(apple, tmp_path):
+    setup = setup_of(apple, visibility="seen")
+    plans = ("go_to_room living_room_0\nturn 1", "turn 1\nturn 1", "turn 1")
+    answers, asked = replanned(apple, tmp_path, setup, *plans)
+    assert len(asked) == 2
+    assert len(asked[1].rows) > len(asked[0].rows)
+    assert json.loads(answers[0].text) == ["go_to_room living_room_0", "turn 1.0", "turn 1.0", "done"]
+
+
+def test_command_plays_episodes_with_a_policy_and_repeats_them(bench, tmp_path):
+    tasks = load_tasks(bench.folder)
+    settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16})
+    progress = TrainingProgress(step=1, grpo_ready=True)
+    CheckpointStore(tmp_path / "run" / CHECKPOINTS, keep=1).save(
+        new_policy(settings, tasks), {}, progress, settings
+    )
+    common = (
+        f"--model={tmp_path / 'run'}",
+        "--interactive",
+        "--samples=1",
+        "--temperature=0",
+        "--max-tokens=12",
+    )
+    sheets = []
+    for name in ("a", "b"):
+        code, printed = run_evaluation(f"--bench={bench.folder}", *common, f"--out={tmp_path / name}")
+        assert code == 0, printed
+        sheets.append((tmp_path / name / "answers.jsonl").read_bytes())
+    assert sheets[0] == sheets[1]
+
+
 def test_command_plays_episodes_and_judges_them_again(bench, tmp_path):
     common = (f"--bench={bench.folder}", "--split=all", f"--out={tmp_path}", "--samples=1")
     code, printed = run_evaluation("--baseline=oracle", "--interactive", "--visibility=seen", *common)
@@ -184,7 +266,7 @@ def test_command_plays_episodes_and_judges_them_again(bench, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--model=runs/a",), "--interactive plays endpoints and baselines on our own tasks"),
+        (("--model=runs/a", "--bench=eai-native"), "eai-native judges whole plans: leave out --interactive"),
         (("--baseline=template",), "the baseline `template` writes whole plans: leave out --interactive"),
         (("--baseline=human",), "the human plans are of eai-native: pass --baseline oracle"),
         (("--baseline=oracle", "--calls-factor=0"), "calls_factor"),
@@ -193,7 +275,7 @@ def test_command_plays_episodes_and_judges_them_again(bench, tmp_path):
 )
 def test_command_refuses_what_plays_no_episodes(bench, tmp_path, arguments, words):
     code, printed = run_evaluation(
-        *arguments, "--interactive", f"--bench={bench.folder}", f"--out={tmp_path / 'out'}"
+        f"--bench={bench.folder}", *arguments, "--interactive", f"--out={tmp_path / 'out'}"
     )
     assert (code, words in printed) == (2, True), printed
 

@@ -1,6 +1,7 @@
 """Choice of the dataset that a command uses, unpacking of the shipped tasks, and what ships."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -10,16 +11,19 @@ from embomatrix.starter.archive import read_packed
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
 from embomatrix.starter.recipes import PARTS, STARTER_PARTS
 from embomatrix.starter.shipped import (
+    SEARCH,
+    VERIFIED,
     archive_of,
+    frozen_file,
     frozen_tasks,
     holds_shipped,
     shipped_parts,
     unpack,
-    verified_file,
 )
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
 from embomatrix.world.difficulty import DifficultyLevel
+from embomatrix.world.task import TaskCategory
 
 
 @pytest.fixture
@@ -27,7 +31,8 @@ def unpacked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
     """Folders to which tasks are unpacked, by a stand-in that takes no seconds."""
     folders: list[Path] = []
 
-    def unpack(folder: Path) -> str:
+    def unpack(folder: Path, parts: Sequence[int]) -> str:
+        assert parts == STARTER_PARTS
         folder.mkdir()
         (folder / TASKS_FILE).write_text("{}\n")
         folders.append(folder)
@@ -112,9 +117,8 @@ def test_a_folder_with_the_shipped_tasks_is_recognised(tasks: Dataset, tmp_path:
     assert not holds_shipped(tmp_path)
 
 
-@pytest.mark.skipif(not verified_file().exists(), reason="the frozen tasks ship with part 2 of the corpus")
 def test_frozen_tasks_are_the_hardest_held_out_ones(tasks: Dataset) -> None:
-    frozen = frozen_tasks(verified_file())
+    frozen = frozen_tasks(frozen_file(VERIFIED))
     chosen = [record for record in tasks.heldout if record.task.task_id in set(frozen.tasks)]
     left = [record for record in tasks.heldout if record.task.task_id not in set(frozen.tasks)]
     assert len(chosen) == len(frozen.tasks) == 100
@@ -122,6 +126,18 @@ def test_frozen_tasks_are_the_hardest_held_out_ones(tasks: Dataset) -> None:
     ranks = list(DifficultyLevel)
     easiest = min(ranks.index(record.difficulty.level) for record in chosen if record.difficulty)
     assert easiest >= max(ranks.index(record.difficulty.level) for record in left if record.difficulty)
+
+
+def test_frozen_searches_are_in_both_splits_and_all_categories() -> None:
+    frozen = frozen_tasks(frozen_file(SEARCH))
+    records = [record for part in shipped_parts() for record in read_packed(archive_of(part))[0]]
+    chosen = [record for record in records if record.task.task_id in set(frozen.tasks)]
+    assert len(chosen) == len(frozen.tasks)
+    assert frozen.digest == shipped.frozen_digest(chosen)
+    for split, least in (("train", 500), ("heldout", 60)):
+        categories = Counter(record.task.category for record in chosen if record.split == split)
+        assert categories.total() >= least
+        assert set(categories) == set(TaskCategory)
 
 
 def test_damaged_list_of_frozen_tasks_is_reported(tmp_path: Path) -> None:

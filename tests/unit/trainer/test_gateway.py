@@ -13,6 +13,7 @@ from embomatrix.rpc.status import DeadlineError, ManagerUnreachableError, Unavai
 from embomatrix.rpc.traffic import TrafficError, TrafficLog, read_traffic
 from embomatrix.rpc.wire.values import Cancelled, InfraCode, InfraFailure, RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
+from embomatrix.skills.seeds import evaluation_seed, training_seed
 from embomatrix.trainer.cluster.gateway import (
     Gateway,
     PlanGroup,
@@ -21,7 +22,6 @@ from embomatrix.trainer.cluster.gateway import (
     result_of,
 )
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import evaluation_seed, training_seed
 
 TASKS = make_tasks(6, 2)
 TASK = TASKS.train[0]

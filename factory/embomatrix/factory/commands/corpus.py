@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -16,7 +16,7 @@ from embomatrix.factory.pipeline.build import Making
 from embomatrix.factory.pipeline.corpus import (
     TASKS,
     check_free,
-    freeze,
+    freeze_hardest,
     join_parts,
     joined_part,
     part_folder,
@@ -26,11 +26,8 @@ from embomatrix.factory.pipeline.store import BUILD_FILE
 from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.starter.archive import content_digest, pack, read_packed
 from embomatrix.starter.recipes import PARTS
-from embomatrix.starter.shipped import archive_of, holds_shipped, shipped_parts, unpack_part
+from embomatrix.starter.shipped import FROZEN_MARK, archive_of, holds_shipped, shipped_parts, unpack_part
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
-
-FROZEN_MARK: Final = b'"digest": "sha256:'
-"""Mark of a file of frozen tasks."""
 
 
 def corpus(
@@ -112,7 +109,7 @@ def corpus(
             digest = content_digest(found) if packed is None else pack(found, packed / f"tasks-{number}.xz")
             say(f"part {number}: {len(found.records)} tasks, {digest}")
         if frozen is not None:
-            say(f"Internal-Verified 2: {count} tasks, {freeze(records, count, frozen).digest}")
+            say(f"Internal-Verified 2: {count} tasks, {freeze_hardest(records, count, frozen).digest}")
 
 
 def _with_proofs(proofs: Path) -> Making:

@@ -9,8 +9,9 @@ import typer
 from embomatrix.factory.commands.options import Jobs, processes
 from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
 from embomatrix.factory.evaluate.search import search_tasks, searches
-from embomatrix.host.own_files import Force
+from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
+from embomatrix.starter.shipped import FROZEN_MARK, freeze
 from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, write_dataset
 from embomatrix.world.task import TaskCategory
 
@@ -25,6 +26,9 @@ def search(
         ),
     ] = None,
     split: Annotated[str, typer.Option(help="Select from this split only, train or heldout.")] = "",
+    frozen: Annotated[
+        Path | None, typer.Option("--freeze", help="Write the ids of the selected tasks to this file.")
+    ] = None,
     jobs: Jobs = None,
     force: Force = False,
 ) -> None:
@@ -41,6 +45,9 @@ def search(
         )
     if not force and (out / TASKS_FILE).exists():
         fail(f"{out} holds a dataset already: name another folder with --out, or pass --force to replace it")
+    if frozen is not None:
+        keep_foreign("factory search", [frozen], FROZEN_MARK, force=force)
+        prepare_output("factory search", frozen)
     with user_errors(out):
         found = Dataset.load(dataset)
         records = [record for record in found.records if split in ("", record.split)]
@@ -50,6 +57,8 @@ def search(
         chosen = searches(records, results)
         digests = dict.fromkeys(record.bundle_digest for record in chosen)
         write_dataset(out, chosen, {digest: found.bundle_bytes(digest) for digest in digests})
+        if frozen is not None:
+            say(f"frozen: {len(chosen)} tasks, {freeze(chosen, frozen).digest}")
     hidden = sum(result.is_search for result in results.values())
     say(
         f"{hidden} of {len(records)} tasks hide something from the first look; {len(chosen)} are solved: {out}"

@@ -1,9 +1,7 @@
 """Corpus: parts built by the recipes of ``embomatrix.starter``, joined, and the benchmark that is frozen from it."""
 
-import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
@@ -11,11 +9,10 @@ from embomatrix.factory.pipeline.merge import MERGED_FILE, MergeSummary, Resolut
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.starter.recipes import PARTS, SEED, Recipe
-from embomatrix.starter.shipped import FrozenTasks, frozen_digest
+from embomatrix.starter.shipped import FrozenTasks, freeze
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 from embomatrix.world.difficulty import DifficultyLevel, shuffle_key
-from embomatrix.world.whole_file import write_whole
 
 PARTS_FOLDER: Final = "parts"
 TASKS: Final = "tasks"
@@ -67,7 +64,7 @@ def joined_part(folder: Path, part: int) -> Dataset:
     return Dataset(joined.folder, tuple(record for record in joined.records if record.task.task_id in own))
 
 
-def freeze(records: Sequence[TaskRecord], count: int, file: Path) -> FrozenTasks:
+def freeze_hardest(records: Sequence[TaskRecord], count: int, file: Path) -> FrozenTasks:
     """Write the ids of the hardest ``count`` held-out tasks to a file, with the digest of their records.
 
     Raises DatasetError for fewer tasks, or OSError.
@@ -75,10 +72,7 @@ def freeze(records: Sequence[TaskRecord], count: int, file: Path) -> FrozenTasks
     held_out = [record for record in records if record.split == "heldout"]
     if len(held_out) < count:
         raise DatasetError(f"found {len(held_out)} held-out tasks to freeze: expected at least {count}")
-    chosen = _hardest(held_out, count)
-    frozen = FrozenTasks(frozen_digest(chosen), tuple(record.task.task_id for record in chosen))
-    write_whole(file, (json.dumps(asdict(frozen), indent=1) + "\n").encode("ascii"))
-    return frozen
+    return freeze(_hardest(held_out, count), file)
 
 
 def _hardest(records: Sequence[TaskRecord], count: int) -> list[TaskRecord]:

@@ -15,10 +15,11 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
+from embomatrix.skills.seeds import evaluation_seed, training_seed
 from embomatrix.trainer.adapters.rows import dataset_named, messages, tasks_of
 from embomatrix.trainer.adapters.scorer import PlanScorer, shared_scorer
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import evaluation_seed, load_tasks, training_seed
+from embomatrix.trainer.data.tasks import load_tasks
 
 
 def rows(dataset: str | Path, split: str = "train", seed: int = 0) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import atexit
+import dataclasses
 import functools
 import itertools
 import os
@@ -20,18 +21,20 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.reward.settings import PAPER, RewardSettings, RewardSettingsError
 from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.cluster_address import cluster_named
 from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.trust import read_ca, read_token
 from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 from embomatrix.skills.prompt import Codec
+from embomatrix.skills.seeds import training_seed
 from embomatrix.trainer.cluster.gateway import Gateway, PlanGroup, PlanOutcome
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks, training_seed
+from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks
 
 RUN_NAME: Final = "adapter"
+REWARD_VARIABLE: Final = "EMBOMATRIX_REWARD"
+"""Environment variable with coefficients of the reward, as ``reward_named`` reads them."""
 GROUPING_S: Final = 0.005
 """Wait of a single text for others of its task: trainers that score one by one would otherwise send batches of one."""
 
@@ -210,6 +213,29 @@ class _PendingGroup:
     work: asyncio.Task[list[PlanOutcome]]
 
 
+def reward_named(given: str = "") -> RewardSettings:
+    """Return the coefficients in a text such as ``goal=10,format=0``, by default that in ``EMBOMATRIX_REWARD``.
+
+    Those that it leaves out have the paper's values. Raises TrainerError.
+    """
+    text = given or os.environ.get(REWARD_VARIABLE, "")
+    names = [field.name for field in dataclasses.fields(RewardSettings)]
+    values: dict[str, float] = {}
+    for part in filter(None, map(str.strip, text.split(","))):
+        name, _, number = map(str.strip, part.partition("="))
+        try:
+            values[names[names.index(name)]] = float(number)
+        except ValueError:
+            raise TrainerError(
+                f"the reward's coefficients are {text!r}, found {part!r}: expected NAME=NUMBER with one of the names "
+                f"{', '.join(names)}"
+            ) from None
+    try:
+        return RewardSettings(**values)
+    except RewardSettingsError as error:
+        raise TrainerError(f"the reward's coefficients are {text!r}: {error}") from error
+
+
 def scorer_for(
     dataset: str | Path,
     manager: str = "",
@@ -217,21 +243,19 @@ def scorer_for(
     ca: str | Path = "",
     *,
     seed: int = 0,
-    reward: RewardSettings = PAPER,
+    reward: RewardSettings | None = None,
 ) -> PlanScorer:
-    """Create a scorer for the cluster at ``manager`` (HOST:PORT). Raises TrainerError.
+    """Create a scorer for a cluster, given as in ``cluster_named``. Raises TrainerError.
 
-    Defaults come from ``EMBOMATRIX_MANAGER``, ``EMBOMATRIX_TOKEN`` (or @FILE) and ``EMBOMATRIX_CA``, as for our commands.
+    ``reward`` has the coefficients of the reward, by default those of ``reward_named``.
     """
-    address = manager or os.environ.get("EMBOMATRIX_MANAGER", "") or DEFAULT_ADDRESS
-    authority = str(ca) or os.environ.get("EMBOMATRIX_CA", "")
+    coefficients = reward_named() if reward is None else reward
     try:
-        secret = read_token(token or os.environ.get("EMBOMATRIX_TOKEN", ""))
-        trusted = read_ca(Path(authority) if authority else None)
+        at = cluster_named(manager, token, ca)
     except ClusterError as error:
         raise TrainerError(str(error)) from error
-    connect = functools.partial(ClusterClient, address, secret, ca=trusted)
-    return PlanScorer(functools.partial(load_tasks, Path(dataset)), connect, seed=seed, reward=reward)
+    connect = functools.partial(ClusterClient, at.manager, at.token, ca=at.ca)
+    return PlanScorer(functools.partial(load_tasks, Path(dataset)), connect, seed=seed, reward=coefficients)
 
 
 shared_scorer = functools.cache(scorer_for)

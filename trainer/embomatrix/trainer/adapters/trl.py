@@ -1,11 +1,11 @@
-"""Adapter for TRL's ``GRPOTrainer``: a reward function, and a mixin that announces the tasks of coming steps.
+"""Adapter for TRL's ``GRPOTrainer``: a reward function for whole plans, and a mixin that announces the tasks of coming steps.
 
 TRL itself is not imported: the reward is a callable, and the mixin overrides one method of the trainer class.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from torch.utils.data import BatchSampler
@@ -32,6 +32,10 @@ class ClusterReward:
         """Create a reward on the cluster at this address; see ``scorer_for``."""
         return cls(scorer_for(dataset, manager, **options))
 
+    def announce(self, steps: Sequence[Sequence[str]], group: int) -> None:
+        """Announce the tasks of this step and the next ones to the cluster, with ``group`` plans each."""
+        self.scorer.announce(steps, group)
+
     async def __call__(
         self,
         prompts: Sequence[object],
@@ -53,10 +57,17 @@ class ClusterReward:
         return [None if outcome.reward is None else outcome.reward.total for outcome in outcomes]
 
 
+@runtime_checkable
+class AnnouncedTo(Protocol):
+    """Reward function whose cluster wants to know the tasks of coming steps: ``ClusterReward``, ``ClusterEpisodes``."""
+
+    def announce(self, steps: Sequence[Sequence[str]], group: int) -> None: ...
+
+
 class ClusterLookahead:
     """Mixin before ``GRPOTrainer``: announces the tasks of coming generations, so that the cluster loads their scenes.
 
-    It uses the first ``ClusterReward`` among the reward functions, in the main process only.
+    It uses the first reward function that is ``AnnouncedTo``, in the main process only.
     """
 
     lookahead_steps = 3
@@ -64,7 +75,7 @@ class ClusterLookahead:
     def _get_train_sampler(self, *arguments: Any) -> Any:
         sampler = super()._get_train_sampler(*arguments)  # type: ignore[misc]  # of the trainer that this is mixed into
         trainer: Any = self
-        rewards = [reward for reward in trainer.reward_funcs if isinstance(reward, ClusterReward)]
+        rewards = [reward for reward in trainer.reward_funcs if isinstance(reward, AnnouncedTo)]
         if not rewards or not trainer.accelerator.is_main_process:
             return sampler
         repeats = trainer.num_generations * trainer.num_iterations * trainer.args.steps_per_generation
@@ -74,7 +85,7 @@ class ClusterLookahead:
 
         def announce(steps: list[list[int]]) -> None:
             named = [[task_ids[index] for index in step] for step in steps]
-            rewards[0].scorer.announce(named, trainer.num_generations)
+            rewards[0].announce(named, trainer.num_generations)
 
         return AnnouncedSampler(sampler, prompts * repeats, self.lookahead_steps, announce)
 

@@ -16,22 +16,27 @@ except ModuleNotFoundError as error:
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.adapters.rows import dataset_named, tasks_of
-from embomatrix.trainer.adapters.scorer import shared_scorer
+from embomatrix.trainer.adapters.scorer import reward_named, shared_scorer
 
 __all__ = ["HouseholdTaskset"]
 
 
 class HouseholdConfig(vf.TasksetConfig):  # type: ignore[misc]  # untyped where it is not installed
-    """``dataset``: folder of a dataset, by default that of ``EMBOMATRIX_DATASET``; ``split``: train or heldout."""
+    """``dataset``: folder of a dataset, by default that of ``EMBOMATRIX_DATASET``; ``split``: train or heldout.
+
+    ``reward``: coefficients of the reward, a text for ``reward_named``.
+    """
 
     dataset: str = ""
     split: str = "train"
+    reward: str = ""
 
 
 class HouseholdData(vf.TaskData):  # type: ignore[misc]
-    """``dataset`` is stored with each task, so that any process can find its scene."""
+    """``dataset`` and ``reward`` are stored with each task, so that any process can find its scene and score it."""
 
     dataset: str
+    reward: str
     category: str
 
 
@@ -41,7 +46,8 @@ class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):  # type: i
     @vf.reward  # type: ignore[untyped-decorator]
     async def tiers(self, trace: vf.Trace) -> dict[str, float]:
         """Return the three tiers, which add up to the reward. Success is a separate metric."""
-        reward = await shared_scorer(self.data.dataset).reward_of(str(self.data.id), trace.last_reply)
+        scorer = shared_scorer(self.data.dataset, reward=reward_named(self.data.reward))
+        reward = await scorer.reward_of(str(self.data.id), trace.last_reply)
         trace.record_metrics({"success": float(reward.success)})
         return reward.tiers
 
@@ -50,7 +56,8 @@ class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):  # type: ign
     """Tasks of one split."""
 
     def load(self) -> Iterator[HouseholdTask]:
-        """Raises TrainerError if no dataset is named, or if it can't be read."""
+        """Raises TrainerError if no dataset is named, if it can't be read, and for wrong coefficients."""
+        reward_named(self.config.reward)
         dataset = dataset_named(self.config.dataset, "--env.taskset.dataset")
         for task in tasks_of(dataset, self.config.split):
             prompt = prompt_for(task.situation, Codec.JSON)
@@ -59,6 +66,7 @@ class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):  # type: ign
                 prompt=prompt.user,
                 system_prompt=prompt.system,
                 dataset=dataset,
+                reward=self.config.reward,
                 category=task.task.category.value,
             )
             yield HouseholdTask(data, self.config.task)

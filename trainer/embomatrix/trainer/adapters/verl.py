@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.trainer.adapters.rows import dataset_named
-from embomatrix.trainer.adapters.scorer import shared_scorer
+from embomatrix.trainer.adapters.scorer import reward_named, shared_scorer
 
 
 async def compute_score(
@@ -21,15 +21,17 @@ async def compute_score(
     manager: str = "",
     token: str = "",
     ca: str = "",
+    reward: str = "",
     **_: object,
 ) -> dict[str, float]:
     """Score one answer.
 
-    ``ground_truth`` is the task's id; the keyword arguments are ``reward.custom_reward_function.reward_kwargs``. verl has no
-    mark for a missing reward, and NaN would spoil its step, so lost rollouts are repeated.
+    ``ground_truth`` is the task's id; the keyword arguments are ``reward.custom_reward_function.reward_kwargs``, among them
+    ``reward``, a text for ``reward_named``. verl has no mark for a missing reward, and NaN would spoil its step, so lost
+    rollouts are repeated.
     """
     named = dataset_named(dataset, "custom_reward_function.reward_kwargs.dataset")
-    scorer = shared_scorer(named, manager, token, ca)
+    scorer = shared_scorer(named, manager, token, ca, reward=reward_named(reward))
     return reward_payload(await scorer.reward_of(ground_truth, solution_str))
 
 

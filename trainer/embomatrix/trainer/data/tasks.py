@@ -1,6 +1,5 @@
 """Training tasks and their order: seeded, different in each epoch, known arbitrarily far ahead."""
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -121,24 +120,6 @@ def training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
             f"the oracle plan of the dataset's task {task.task_id!r} is damaged ({error}): build the dataset again"
         ) from error
     return TrainingTask(task, situation_of(bundle.scene, task), record.bundle_digest, oracle)
-
-
-HALF: Final = 2**31
-"""Seeds below it are for evaluation, seeds from it to twice its value for training."""
-
-
-def evaluation_seed(run_seed: int, task_id: str) -> int:
-    """Seed in [0, 2^31) of all rollouts of a task in an evaluation, so equal plans get equal rewards. No training uses it."""
-    return _half(f"{run_seed}:{task_id}")
-
-
-def training_seed(run_seed: int, task_id: str, epoch: int = 0) -> int:
-    """Seed in [2^31, 2^32) of all rollouts of a task in one epoch of training."""
-    return HALF + _half(f"{run_seed}:{task_id}:{epoch}")
-
-
-def _half(text: str) -> int:
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1
 
 
 UNKNOWN_LENGTH: Final = 10_000

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-from embomatrix.starter.shipped import STARTER, frozen_digest, frozen_tasks, unpacked_tasks, verified_file
+from embomatrix.starter.shipped import FROZEN, STARTER, frozen_dataset, unpacked_tasks
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import TrainingTask, read_tasks
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord, record_to_json
@@ -23,8 +23,6 @@ NAMED: Final[Mapping[str, tuple[Path, str]]] = {
     "eai": (Path("build/eai"), "embomatrix factory import"),
 }
 """Benchmarks that a command creates, with their folders."""
-VERIFIED: Final = "internal-verified-2"
-"""Benchmark that ships with the package: the hardest held-out tasks of the corpus."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +87,11 @@ def find_benchmark(
     takes the first tasks only. With the profile ``PAPER``, tasks that need another household skill fail by rule. Raises
     TrainerError.
     """
-    if named == VERIFIED:
-        return _verified(split, limit, profile)
+    if named in FROZEN and not Path(named).exists():
+        return _frozen(named, split, limit, profile)
     path = _path_of(named)
     if not path.exists():
-        remedy = (
-            f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join((STARTER, VERIFIED, *NAMED))}"
-        )
+        remedy = f"pass a dataset folder, its {TASKS_FILE}, or one of {', '.join((STARTER, *FROZEN, *NAMED))}"
         if named in NAMED:
             remedy = f"create it with `{NAMED[named][1]}`, or pass its folder"
         raise TrainerError(f"no benchmark at {path}: {remedy}")
@@ -114,28 +110,16 @@ def _path_of(named: str) -> Path:
     return NAMED[named][0] if named in NAMED else Path(named)
 
 
-def _verified(split: str, limit: int | None, profile: Profile) -> Benchmark:
-    """Return the frozen tasks. The training tasks are those that ship with them. Raises TrainerError."""
-    if split not in ("", "heldout"):
-        raise TrainerError(f"all tasks of {VERIFIED} are held out, found --split {split}: leave --split out")
-    if not verified_file().exists():
-        raise TrainerError(
-            f"{VERIFIED} does not ship with this version: pass a dataset folder, or install a newer version"
-        )
+def _frozen(named: str, split: str, limit: int | None, profile: Profile) -> Benchmark:
+    """Return frozen tasks. The training tasks are those that they were chosen from. Raises TrainerError."""
     try:
-        folder = unpacked_tasks()
-        frozen, records = frozen_tasks(verified_file()), Dataset.load(folder).records
+        dataset, records = frozen_dataset(named)
     except (DatasetError, OSError) as error:
-        raise TrainerError(f"{VERIFIED} can't be read: {error}") from error
-    named = frozenset(frozen.tasks)
-    chosen = tuple(record for record in records if record.task.task_id in named)
-    found = frozen_digest(chosen)
-    if found != frozen.digest:
-        raise TrainerError(
-            f"the tasks of {VERIFIED} in {folder} have the digest {found}, expected {frozen.digest}: remove the folder, so "
-            "that the shipped tasks are unpacked again"
-        )
-    return _within(Benchmark(VERIFIED, folder, "heldout", chosen, frozenset(), records), limit, profile)
+        raise TrainerError(str(error)) from error
+    chosen, found_split = _select_split(dataset.records, split, Path(named))
+    return _within(
+        Benchmark(named, dataset.folder, found_split, chosen, frozenset(), records), limit, profile
+    )
 
 
 def _within(bench: Benchmark, limit: int | None, profile: Profile) -> Benchmark:

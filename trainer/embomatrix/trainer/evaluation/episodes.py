@@ -24,9 +24,10 @@ from embomatrix.llm.values import ChatModel, ChatRequest, LlmError, Message, Rep
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
 from embomatrix.skills.parse import DONE, plan_to_lines
 from embomatrix.skills.prompt import Codec, Prompt, prompt_for
+from embomatrix.skills.seeds import evaluation_seed
 from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
+from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.evaluation.answer_sources import PURPOSE, OnProgress, seed_of
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup
 from embomatrix.trainer.evaluation.benchmark import Benchmark

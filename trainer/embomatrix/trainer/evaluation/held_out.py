@@ -17,6 +17,7 @@ import numpy as np
 from embomatrix.pages.figures import Interval
 from embomatrix.skills.parse import PlanError
 from embomatrix.skills.prompt import Codec
+from embomatrix.skills.seeds import evaluation_seed
 from embomatrix.skills.syntax import Plan
 from embomatrix.trainer.cluster.gateway import (
     Gateway,
@@ -26,7 +27,7 @@ from embomatrix.trainer.cluster.gateway import (
     refuse_without_workers,
     result_of,
 )
-from embomatrix.trainer.data.tasks import TrainingTask, evaluation_seed
+from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.evaluation.answers import Answer
 from embomatrix.trainer.evaluation.intervals import mean_over_tasks, paired_difference
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from embomatrix.rpc.wire.values import Outcome, Rollout
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, limited, with_indices
+from embomatrix.skills.seeds import evaluation_seed
 from embomatrix.skills.syntax import Plan
 from embomatrix.trainer.cluster.executor import Executor
-from embomatrix.trainer.data.tasks import evaluation_seed
 from embomatrix.trainer.evaluation.benchmark import Benchmark
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
 from embomatrix.world.task import Profile

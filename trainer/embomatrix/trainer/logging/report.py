@@ -265,7 +265,7 @@ def _next_steps(summary: TrainingSummary, source: TrainedOn) -> str:
         ),
         (
             f"embomatrix train --resume --dataset {dataset} --out {summary.report.parent} --steps {2 * summary.outcome.steps}",
-            "continues the run",
+            "continues the run on a cluster of this machine; --manager and --token name another",
         ),
     )
     lines = (

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from embomatrix.skills.seeds import training_seed
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.settings import SeedPer
-from embomatrix.trainer.data.tasks import Curriculum, Schedule, training_seed
+from embomatrix.trainer.data.tasks import Curriculum, Schedule
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord
 from embomatrix.trainer.grpo.update import StepPlan, Updater
