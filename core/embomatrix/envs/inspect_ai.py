@@ -24,7 +24,7 @@ except ModuleNotFoundError as error:
 
 from embomatrix.envs.environment import Environment
 from embomatrix.envs.opening import make
-from embomatrix.envs.rules import EpisodeReward, EpisodeRules, Visibility
+from embomatrix.envs.rules import EpisodeReward, EpisodeRules, Visibility, rules_of
 from embomatrix.envs.tools import TOOLS, PaperTools
 from embomatrix.rpc.cluster_address import cluster_named
 from embomatrix.skills.episode_text import system_for_tools
@@ -46,12 +46,13 @@ def household(
     manager: str = "",
     seed: int = 0,
 ) -> Task:
-    """Episodes of the tasks of a dataset: ``starter``, the shipped one, or a folder.
+    """Episodes of the tasks of a dataset: ``starter`` or ``search``, which ship, or a folder.
 
     They are executed in this process, or on the cluster that ``manager`` or ``EMBOMATRIX_MANAGER`` names. Seeds are those of
-    ``embomatrix eval``. Raises DatasetError, and ClusterError if the manager refuses.
+    ``embomatrix eval``. Raises ValueError for an unknown visibility, DatasetError, and ClusterError if the manager
+    refuses.
     """
-    rules = EpisodeRules(visibility=Visibility(visibility), calls=calls)
+    rules = rules_of(EpisodeRules(calls=calls), visibility)
     environment = _opened(dataset, split, rules, manager)
     samples = [
         Sample(

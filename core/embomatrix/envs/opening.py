@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from embomatrix.envs.environment import Environment
-from embomatrix.envs.rules import EpisodeRules, Visibility, member
+from embomatrix.envs.rules import EpisodeRules, member, rules_of
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.prompt import Codec
 from embomatrix.starter.shipped import STARTER, dataset_named
@@ -39,9 +38,7 @@ def make(
 
     Raises ValueError for an unknown word, DatasetError for a missing dataset, ClusterError if the manager refuses.
     """
-    known = EpisodeRules() if rules is None else rules
-    if visibility is not None:
-        known = replace(known, visibility=member(Visibility, "visibility", visibility))
+    known = rules_of(rules, visibility)
     form = member(Codec, "codec", codec)
     loaded = dataset_named(dataset)
     simulation = _simulation(loaded, reward, manager, token, ca)

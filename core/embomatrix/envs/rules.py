@@ -1,6 +1,6 @@
 """Rules of an episode: what a policy is told, and when the episode ends."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, TypeVar
 
@@ -80,6 +80,14 @@ class EpisodeRules:
             value = getattr(self, name)
             if not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
                 raise ValueError(f"{name} is {value!r}: expected 0 or a positive number")
+
+
+def rules_of(rules: EpisodeRules | None, visibility: str | None) -> EpisodeRules:
+    """Return the rules, by default the usual ones; a given visibility counts more than theirs. Raises ValueError."""
+    known = EpisodeRules() if rules is None else rules
+    if visibility is None:
+        return known
+    return replace(known, visibility=member(Visibility, "visibility", visibility))
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,14 +5,13 @@ The model calls skills as tools, and is told after each call what happened. TRL 
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
 
 from embomatrix.envs.environment import Environment
-from embomatrix.envs.rules import EpisodeRules, Visibility
+from embomatrix.envs.rules import EpisodeRules, Visibility, rules_of
 from embomatrix.envs.simulation import ClusterSimulation
 from embomatrix.envs.tools import HouseholdTools, PaperTools
 from embomatrix.reward.settings import RewardSettings
@@ -97,14 +96,12 @@ class ClusterEpisodes:
         reward: RewardSettings | None = None,
         seed: int = 0,
     ) -> Self:
-        """Open episodes on a cluster. Raises TrainerError.
+        """Open episodes on a cluster. Raises TrainerError, and ValueError for an unknown visibility.
 
         The cluster is named as in ``cluster_named``, the reward's coefficients as in ``scorer_for``; dataset, visibility and
         rules are those of ``envs.make``.
         """
-        known = EpisodeRules() if rules is None else rules
-        if visibility is not None:
-            known = replace(known, visibility=Visibility(visibility))
+        known = rules_of(rules, visibility)
         try:
             data = dataset_named(dataset)
             named = cluster_named(manager, token, ca)
