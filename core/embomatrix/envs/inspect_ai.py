@@ -25,9 +25,8 @@ except ModuleNotFoundError as error:
 from embomatrix.envs.environment import Environment
 from embomatrix.envs.opening import make
 from embomatrix.envs.rules import EpisodeReward, EpisodeRules, Visibility, rules_of
-from embomatrix.envs.tools import TOOLS, PaperTools
+from embomatrix.envs.tools import TOOLS, PaperTools, system_text
 from embomatrix.rpc.cluster_address import cluster_named
-from embomatrix.skills.episode_text import system_for_tools
 from embomatrix.skills.seeds import evaluation_seed
 from embomatrix.skills.syntax import MAX_STEPS, PROFILES
 from embomatrix.starter.shipped import STARTER
@@ -37,7 +36,7 @@ _REWARD: Final = "embomatrix:reward"
 """Key of an episode's reward in the store of its sample."""
 
 
-@task  # type: ignore[untyped-decorator]  # untyped where it is not installed
+@task
 def household(
     dataset: str = STARTER,
     split: str = "heldout",
@@ -80,7 +79,7 @@ def _opened(dataset: str, split: str, rules: EpisodeRules, manager: str) -> Envi
     return make(dataset, split=split, rules=rules, manager=named.manager, token=named.token, ca=named.ca)
 
 
-@solver  # type: ignore[untyped-decorator]
+@solver
 def play_episode(environment: Environment) -> Solver:
     """Let the model call skills until it answers without a call, or the rules of the environment end the episode."""
 
@@ -88,9 +87,8 @@ def play_episode(environment: Environment) -> Solver:
         kind = TOOLS[Profile(state.metadata["profile"])]
         tools = kind(environment)
         opening = await asyncio.to_thread(tools.reset, str(state.sample_id), int(state.metadata["seed"]))
-        seen = environment.rules.visibility is Visibility.SEEN
         state.messages = [
-            ChatMessageSystem(content=system_for_tools(kind.profile, seen=seen)),
+            ChatMessageSystem(content=system_text(environment, kind.profile)),
             ChatMessageUser(content=opening),
         ]
         state.tools = as_inspect_tools(tools)
@@ -105,7 +103,7 @@ def play_episode(environment: Environment) -> Solver:
     return solve
 
 
-@scorer(  # type: ignore[untyped-decorator]
+@scorer(
     metrics={
         "success": [accuracy(), stderr()],
         "reward": [mean(), stderr()],

@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
+from embomatrix.envs.rules import Visibility
+from embomatrix.skills.episode_text import system_for_tools
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.task import Profile
 
@@ -194,6 +196,11 @@ class HouseholdTools(PaperTools):
             source_index: Number that follows the name of the source.
         """
         return self._call(Skill.SOAK, object_index=object_index, source_index=source_index)
+
+
+def system_text(environment: Environment, profile: Profile) -> str:
+    """System text of the environment's episodes for a model that calls the tools of a profile."""
+    return system_for_tools(profile, seen=environment.rules.visibility is Visibility.SEEN)
 
 
 TOOLS: Final = {kind.profile: kind for kind in (PaperTools, HouseholdTools)}

@@ -11,15 +11,14 @@ from typing import Any, Final, Self
 import numpy as np
 
 from embomatrix.envs.environment import Environment
-from embomatrix.envs.rules import EpisodeRules, Visibility, rules_of
+from embomatrix.envs.rules import EpisodeRules, rules_of
 from embomatrix.envs.simulation import ClusterSimulation
-from embomatrix.envs.tools import HouseholdTools, PaperTools
+from embomatrix.envs.tools import HouseholdTools, PaperTools, system_text
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.cluster_address import cluster_named
 from embomatrix.rpc.episodes import TurnFailedError
 from embomatrix.rpc.status import ClusterError
-from embomatrix.skills.episode_text import system_for_tools
 from embomatrix.skills.prompt import Codec
 from embomatrix.skills.seeds import evaluation_seed, training_seed
 from embomatrix.skills.syntax import Skill
@@ -121,7 +120,7 @@ class ClusterEpisodes:
         return [
             {
                 "prompt": [
-                    {"role": "system", "content": self._system(record.task.profile)},
+                    {"role": "system", "content": system_text(self.environment, record.task.profile)},
                     {"role": "user", "content": ""},
                 ],
                 "task_id": record.task.task_id,
@@ -172,9 +171,6 @@ class ClusterEpisodes:
     def close(self) -> None:
         """End the run at the manager."""
         self.environment.close()
-
-    def _system(self, profile: Profile) -> str:
-        return system_for_tools(profile, seen=self.environment.rules.visibility is Visibility.SEEN)
 
 
 def means(environments: Sequence[ErrorKeeping]) -> dict[str, float]:

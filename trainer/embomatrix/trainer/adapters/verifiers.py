@@ -21,7 +21,7 @@ from embomatrix.trainer.adapters.scorer import reward_named, shared_scorer
 __all__ = ["HouseholdTaskset"]
 
 
-class HouseholdConfig(vf.TasksetConfig):  # type: ignore[misc]  # untyped where it is not installed
+class HouseholdConfig(vf.TasksetConfig):
     """``dataset``: folder of a dataset, by default that of ``EMBOMATRIX_DATASET``; ``split``: train or heldout.
 
     ``reward``: coefficients of the reward, a text for ``reward_named``.
@@ -32,7 +32,7 @@ class HouseholdConfig(vf.TasksetConfig):  # type: ignore[misc]  # untyped where 
     reward: str = ""
 
 
-class HouseholdData(vf.TaskData):  # type: ignore[misc]
+class HouseholdData(vf.TaskData):
     """``dataset`` and ``reward`` are stored with each task, so that any process can find its scene and score it."""
 
     dataset: str
@@ -40,10 +40,10 @@ class HouseholdData(vf.TaskData):  # type: ignore[misc]
     category: str
 
 
-class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):  # type: ignore[misc]
+class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):
     """Task with one plan as its answer. A rollout that is lost repeatedly is an error of the rollout, never a number."""
 
-    @vf.reward  # type: ignore[untyped-decorator]
+    @vf.reward
     async def tiers(self, trace: vf.Trace) -> dict[str, float]:
         """Return the three tiers, which add up to the reward. Success is a separate metric."""
         scorer = shared_scorer(self.data.dataset, reward=reward_named(self.data.reward))
@@ -52,7 +52,7 @@ class HouseholdTask(vf.Task[HouseholdData, vf.State, vf.TaskConfig]):  # type: i
         return reward.tiers
 
 
-class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):  # type: ignore[misc]
+class HouseholdTaskset(vf.Taskset[HouseholdTask, HouseholdConfig]):
     """Tasks of one split."""
 
     def load(self) -> Iterator[HouseholdTask]:
