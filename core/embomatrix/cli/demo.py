@@ -15,15 +15,15 @@ from rich.logging import RichHandler
 from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, run_command
 from embomatrix.host.failure import fail
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
-from embomatrix.starter.shipped import unpack
+from embomatrix.starter.shipped import demo_settings, unpack
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 
 DEFAULT_OUT: Final = Path("runs/demo")
 IMITATION_STEPS: Final = 340
-GRPO_STEPS: Final = 420
+GRPO_STEPS: Final = 160
 """Budgets in steps: the same seed gives the same curve on a fast machine and on a slow one."""
-EVALUATE_EVERY: Final = 70
-"""Steps of GRPO between evaluations: five beside those before and after, each in a few seconds."""
+EVALUATE_EVERY: Final = 40
+"""Steps of GRPO between evaluations: three beside those before and after, each in a few seconds."""
 console = Console()
 
 
@@ -67,6 +67,7 @@ def demo(
             f"--imitate-steps={imitate_steps}",
             f"--seed={seed}",
             f"--evaluate-every={EVALUATE_EVERY}",
+            *([f"--settings={demo_settings()}"] if model == "tiny" else []),
         ]
         if minutes is not None:
             console.print(

@@ -6,7 +6,7 @@ import random
 import signal
 import socket
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -17,6 +17,10 @@ from embomatrix.host.parent import with_this_process
 
 MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})
 SERVER_PORTS: Final = range(20_000, 32_768)
+
+MEMORY_SHARE: Final = 0.2
+"""Share of the free memory for the scenes of all workers together. The trainer and a person's other programs need the rest, and
+scenes that stay beyond the look-ahead are of no use before the next epoch: with 0.8, steps took twice as long after a while."""
 
 STOP_S: Final = 60.0
 """Time for an interrupted command to save its state."""
@@ -47,14 +51,15 @@ def local_cluster(folder: Path, *, workers: int, slots: int, dataset: Path | Non
     command = embomatrix_command("manager", "serve", f"--port={port}", f"--http-port={http_port}", *serve)
     manager = ChildSpec("manager", command, environment)
     names = tuple(f"worker-{number}" for number in range(1, workers + 1))
-    daemons = tuple(ChildSpec(name, _worker(name, address, slots, folder), environment) for name in names)
+    each = [f"--slots={slots}", f"--memory-share={MEMORY_SHARE / workers:.4f}"]
+    daemons = tuple(ChildSpec(name, _worker(name, address, folder, each), environment) for name in names)
     supervisor = Supervisor((manager, *daemons), folder / "logs")
     return LocalCluster(address, f"http://127.0.0.1:{http_port}", supervisor, names)
 
 
-def _worker(name: str, address: str, slots: int, folder: Path) -> tuple[str, ...]:
-    own = [f"--slots={slots}", f"--name={name}", f"--cache-dir={folder / 'cache' / name}"]
-    return embomatrix_command("worker", "run", f"--manager={address}", *own)
+def _worker(name: str, address: str, folder: Path, options: Sequence[str]) -> tuple[str, ...]:
+    own = [f"--name={name}", f"--cache-dir={folder / 'cache' / name}"]
+    return embomatrix_command("worker", "run", f"--manager={address}", *own, *options)
 
 
 def without_membership(environment: Mapping[str, str]) -> dict[str, str]:

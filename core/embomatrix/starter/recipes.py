@@ -11,8 +11,6 @@ from typing import Final
 
 SEED: Final = 0
 """Seed of all parts."""
-STARTER_PARTS: Final = (1, 2)
-"""Parts that make up the starter dataset, which `make run` and all commands without a dataset use."""
 
 
 @dataclass(frozen=True, slots=True)

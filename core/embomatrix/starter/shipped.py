@@ -13,7 +13,7 @@ from typing import Final
 
 from embomatrix.starter.archive import packed_records, read_packed
 from embomatrix.starter.options import DATASET_VARIABLE, default_dataset
-from embomatrix.starter.recipes import PARTS, STARTER_PARTS
+from embomatrix.starter.recipes import PARTS
 from embomatrix.world.dataset import (
     TASKS_FILE,
     Dataset,
@@ -29,7 +29,7 @@ from embomatrix.world.whole_file import write_whole
 SHIPPED: Final = "shipped"
 """Name of the shipped policy, where a command takes a policy."""
 STARTER: Final = "starter"
-"""Name of the starter dataset where a folder or a benchmark is asked for."""
+"""Name of the starter dataset, all tasks that ship, where a folder or a benchmark is asked for."""
 VERIFIED: Final = "internal-verified-2"
 """Name of the benchmark of the hardest held-out tasks."""
 SEARCH: Final = "search"
@@ -75,8 +75,8 @@ def dataset_named(named: str | Path) -> Dataset:
     return Dataset.load(unpacked_tasks() if named == STARTER else named)
 
 
-def unpack(folder: Path, parts: Iterable[int] = STARTER_PARTS) -> str:
-    """Write shipped parts to a folder as one dataset, by default the starter dataset.
+def unpack(folder: Path, parts: Iterable[int] = tuple(PARTS)) -> str:
+    """Write shipped parts to a folder as one dataset, by default the starter dataset: all of them.
 
     Return the digest of the parts' digests. Raises DatasetError or OSError.
     """
@@ -92,7 +92,7 @@ def unpack(folder: Path, parts: Iterable[int] = STARTER_PARTS) -> str:
     return f"sha256:{hashlib.sha256(' '.join(digests).encode('ascii')).hexdigest()}"
 
 
-def holds_shipped(folder: Path, parts: Iterable[int] = STARTER_PARTS) -> bool:
+def holds_shipped(folder: Path, parts: Iterable[int] = tuple(PARTS)) -> bool:
     """Return True if a folder holds the records of these shipped parts. Bundles are not compared."""
     try:
         dataset = Dataset.load(folder)
@@ -129,7 +129,7 @@ def frozen_dataset(named: str) -> tuple[Dataset, tuple[TaskRecord, ...]]:
             f"{named} does not ship with this version: pass a dataset folder, or install a newer version"
         )
     frozen = frozen_tasks(frozen_file(named))
-    folder = unpacked_tasks(STARTER_PARTS if named == VERIFIED else shipped_parts())
+    folder = unpacked_tasks()
     records = Dataset.load(folder).records
     ids = frozenset(frozen.tasks)
     chosen = tuple(record for record in records if record.task.task_id in ids)
@@ -173,7 +173,12 @@ def shipped_policy() -> Path:
     return Path(str(resources.files("embomatrix.starter") / _POLICY))
 
 
-def unpacked_tasks(parts: Sequence[int] = STARTER_PARTS) -> Path:
+def demo_settings() -> Path:
+    """Return the file with the settings of `embomatrix demo`, for `embomatrix train --settings`."""
+    return archive_of(1).with_name("demo.toml")
+
+
+def unpacked_tasks(parts: Sequence[int] = tuple(PARTS)) -> Path:
     """Return the folder of shipped parts in the user's cache, by default the starter dataset; unpack them if it is missing.
 
     Raise DatasetError or OSError.

@@ -37,6 +37,7 @@ WORDS = build_vocabulary(
     [task.task.instruction for task in TASKS.train],
 )
 GRAMMAR = PlanGrammar(WORDS, torch.device("cpu"))
+SKILLS = {skill.value for skill in PROFILES[Profile.HOUSEHOLD]}
 POLICY = TinyPolicy(WORDS, DecoderShape(len(WORDS), layers=1, width=16, heads=2, inner=16), seed=0)
 
 
@@ -93,20 +94,19 @@ def test_oracle_plans_are_never_masked(task):
 
 
 def test_only_skills_can_start_a_call():
-    skills = {skill.value for skill in PROFILES[Profile.HOUSEHOLD]}
-    assert next_words(TASKS.train[0].situation, "") == skills
+    assert next_words(TASKS.train[0].situation, "") == SKILLS
 
 
 def test_ambiguous_name_needs_a_number():
     situation = TWINS
     category = situation.rows[-1].category
     assert next_words(situation, f"open {category}") == {"_3", "_7"}
-    assert next_words(situation, f"open {category}_3") == {"\n", "<end>"}
+    assert next_words(situation, f"open {category}_3") == SKILLS | {"<end>"}
 
 
 def test_unique_name_without_a_number_gets_none():
     situation = TASKS.train[0].situation
-    assert next_words(situation, f"open {situation.rows[0].category}") == {"\n", "<end>"}
+    assert next_words(situation, f"open {situation.rows[0].category}") == SKILLS | {"<end>"}
 
 
 def test_vocabulary_of_an_older_checkpoint_offers_the_relations_that_it_has():
@@ -136,7 +136,7 @@ def test_arguments_follow_the_signature_of_the_skill():
     assert next_words(situation, f"place {kind}") == {"ontop", "inside", "under", "nextto"}
     assert kind in next_words(situation, f"heat_object_with_source {kind}")
     assert "1.57" in next_words(situation, "turn")
-    assert next_words(situation, "turn 1.57") == {"\n", "<end>"}
+    assert next_words(situation, "turn 1.57") == SKILLS | {"<end>"}
     room = next(iter(next_words(situation, "go_to_room")))
     assert any(name.startswith(room) for name in situation.rooms)
 

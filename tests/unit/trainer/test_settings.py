@@ -2,6 +2,7 @@
 
 import pytest
 
+from embomatrix.starter.shipped import demo_settings
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import SERVER_TRUNCATE_RATIO, read_settings
 
@@ -13,6 +14,13 @@ def test_file_overrides_defaults_and_options_override_the_file(tmp_path):
         path, {"grpo.chunk": 1, "grpo.steps": None}, {"grpo.group": 6, "grpo.max_new": 9}
     )
     assert (settings.seed, settings.grpo.group, settings.grpo.chunk, settings.grpo.max_new) == (3, 4, 1, 9)
+
+
+def test_settings_of_the_demo_sample_as_many_plans_as_the_defaults_and_need_no_reference():
+    demo, defaults = (read_settings(path, {}).grpo for path in (demo_settings(), None))
+    assert demo.tasks_per_step * demo.group == defaults.tasks_per_step * defaults.group
+    assert demo.chunk * 2 == demo.tasks_per_step  # each of two processes has a microbatch
+    assert demo.kl_coef == 0
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,22 @@ from hypothesis import strategies as st
 from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, plan_in_names, prompt_for
-from embomatrix.skills.syntax import PROFILES
+from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation
 from embomatrix.trainer.cluster.gateway import parse_policy_text
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.decoder import DecoderShape, Shortlist
 from embomatrix.trainer.policy.loading import saved_policy
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.policy.vocabulary import END, UNKNOWN, build_vocabulary
+from embomatrix.trainer.policy.vocabulary import (
+    BREAK,
+    END,
+    GO,
+    SPECIAL,
+    UNKNOWN,
+    Vocabulary,
+    build_vocabulary,
+)
 from embomatrix.world.task import Profile
 
 TASKS = make_tasks(12, 3)
@@ -177,14 +185,46 @@ def test_mask_ends_with_the_end_token():
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
 def test_oracle_plans_survive_encoding_and_decoding(task):
     text = plan_in_names(task.oracle, task.situation)
-    assert parse_policy_text(WORDS.decode(WORDS.encode(text)), task.situation, Codec.NAMES) == task.oracle
+    assert (
+        parse_policy_text(WORDS.decode_plan(WORDS.encode_plan(text)), task.situation, Codec.NAMES)
+        == task.oracle
+    )
 
 
 def test_instruction_phrases_get_the_tokens_of_table_names():
     assert WORDS.encode("the chicken leg") == WORDS.encode("the chicken_leg")
-    assert WORDS.decode(WORDS.encode("move apple_1\npick_up apple_1")) == "move apple_1\npick_up apple_1"
     assert WORDS.encode("apples") == WORDS.encode("apple")
     assert WORDS.encode("xylophone") == [UNKNOWN]
+
+
+OBJECTS = st.sampled_from(
+    [name for row in TASKS.train[0].situation.rows for name in (row.name, row.category)]
+)
+ARGUMENTS = {
+    Arg.OBJECT: OBJECTS,
+    Arg.SOURCE: OBJECTS,
+    Arg.RELATION: st.sampled_from([*PlaceRelation]),
+    Arg.YAW: st.sampled_from(["1.57", "-1.57"]),
+    Arg.DISTANCE: st.sampled_from(["0.5", "2"]),
+    Arg.ROOM: st.sampled_from(TASKS.train[0].situation.rooms),
+}
+CALLS = st.sampled_from(PROFILES[Profile.PAPER]).flatmap(
+    lambda skill: st.tuples(st.just(skill.value), *(ARGUMENTS[argument] for argument in SIGNATURES[skill]))
+)
+
+
+@given(st.lists(CALLS, max_size=12))
+def test_plans_have_no_tokens_for_line_breaks_and_are_decoded_to_one_call_a_line(calls):
+    text = "\n".join(" ".join(call) for call in calls)
+    tokens = WORDS.encode_plan(text)
+    assert WORDS.index[BREAK] not in tokens
+    assert WORDS.decode_plan([*tokens, END, GO]) == text
+
+
+def test_object_that_is_called_like_a_skill_stays_in_its_line():
+    made = Vocabulary((*SPECIAL, BREAK, "open", "move", "_0", "place", "ontop"), ("open",), ())
+    for text in ("move open\nopen open", "open open_0\nmove open", "place open ontop\nopen open"):
+        assert made.decode_plan(made.encode_plan(text)) == text
 
 
 @given(st.text(max_size=200))
@@ -194,7 +234,7 @@ def test_any_text_can_be_encoded(text):
 
 @given(st.lists(st.integers(0, len(WORDS) - 1), max_size=40))
 def test_any_tokens_can_be_decoded(tokens):
-    assert isinstance(WORDS.decode(tokens), str)
+    assert isinstance(WORDS.decode_plan(tokens), str)
 
 
 def test_saved_policy_can_be_loaded(tmp_path):
@@ -225,6 +265,16 @@ def test_description_that_the_weights_contradict_is_refused_at_once(tmp_path, ch
     description = json.loads(path.read_text())
     path.write_text(json.dumps({**description, "shape": {**description["shape"], **change}}))
     with pytest.raises(TrainerError, match=r"is damaged .*expected"):
+        saved_policy(tmp_path, TrainSettings())
+
+
+def test_policy_of_an_older_version_is_refused(tmp_path):
+    policy().save(tmp_path)
+    path = tmp_path / "tiny.json"
+    description = json.loads(path.read_text())
+    del description["format"]
+    path.write_text(json.dumps(description))
+    with pytest.raises(TrainerError, match=r"format 1.*expected 2; train the policy again"):
         saved_policy(tmp_path, TrainSettings())
 
 

@@ -1,4 +1,4 @@
-"""``embomatrix factory starter``: unpack the starter dataset, parts 1 and 2 of the corpus."""
+"""``embomatrix factory starter``: unpack the starter dataset, all tasks that ship with the package."""
 
 from pathlib import Path
 from typing import Annotated

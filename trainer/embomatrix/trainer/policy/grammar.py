@@ -61,8 +61,8 @@ class PromptNames:
 
 @dataclass(frozen=True, slots=True)
 class GrammarState:
-    """Position in each plan, all (R,): skill of the current call (PAD: none), number of its arguments so far, and the stem of a
-    name that may still get a number (PAD: none).
+    """Position in each plan, all (R,): skill of the last call (PAD: none), number of its arguments so far, and the stem of a
+    name that may still get a number (PAD: none). A call ends with its last argument: the next word is a skill or the end.
     """
 
     skill: Tensor
@@ -96,7 +96,8 @@ class PlanGrammar:
         relations = [index[relation.value] for relation in PlaceRelation if relation.value in index]
         self._fixed[_Expects.RELATION, relations] = True
         self._fixed[_Expects.QUANTITY, list(vocabulary.quantity_tokens)] = True
-        self._fixed[_Expects.CALL_END, [self._break, END]] = True
+        self._fixed[_Expects.CALL_END] = self._fixed[_Expects.SKILL]
+        self._fixed[_Expects.CALL_END, END] = True
 
     def prompt_names(self, prompts: Tensor) -> PromptNames:
         """Collect the names in prompts (Q, P), up to the line with the instruction."""
@@ -132,14 +133,13 @@ class PlanGrammar:
 
     def advance(self, state: GrammarState, tokens: Tensor) -> GrammarState:
         """State after one more token of each plan (R,)."""
-        begins = state.skill == PAD
-        ends = tokens == self._break
-        joins = self._number_index[tokens] >= 0
         argument = self._arguments[state.skill, state.arguments]
+        joins = self._number_index[tokens] >= 0
+        begins = ~joins & ((argument == _Expects.SKILL) | (argument == _Expects.CALL_END))
+        fills = ~joins & ~begins
         named = (argument == _Expects.OBJECT) | (argument == _Expects.ROOM)
-        fills = ~begins & ~joins & (argument != _Expects.CALL_END)
-        skill = torch.where(begins, tokens, state.skill).masked_fill(ends, PAD)
-        arguments = (state.arguments + fills).clamp(max=_MAX_ARGUMENTS - 1).masked_fill(ends, 0)
+        skill = torch.where(begins, tokens, state.skill)
+        arguments = (state.arguments + fills).masked_fill(begins, 0)
         open_stem = torch.where(fills & named, tokens, PAD)
         return GrammarState(skill, arguments, open_stem)
 

@@ -37,6 +37,8 @@ _MIN_LOGPROB = -80.0
 """Lower log-probabilities do not change an entropy, and their exponentials (denormal floats) take ten times as long."""
 _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
+_FORMAT: Final = 2
+"""Version of a saved policy's words. Plans of version 1 had a word between two calls."""
 MAX_CONTEXT: Final = 65_536
 """Tokens of the longest context of a saved policy."""
 
@@ -122,7 +124,7 @@ class TinyPolicy:
         return (*tokens[-longest_prompt(self.module.shape) :], GO)
 
     def encode_plan(self, text: str) -> Tokens:
-        return (*self.vocabulary.encode(text), END)
+        return (*self.vocabulary.encode_plan(text), END)
 
     def unknown_words(self, text: str) -> frozenset[str]:
         return self.vocabulary.unknown_words(text)
@@ -164,7 +166,7 @@ class TinyPolicy:
                 hidden, plan = self.module.extend(state.prompts, choice[:, None], state.plan)
                 state = replace(state, plan=plan)
         tokens, mask = tokens[:, :length], mask[:, :length]
-        texts = tuple(self.vocabulary.decode(row) for row in tokens.tolist())
+        texts = tuple(self.vocabulary.decode_plan(row) for row in tokens.tolist())
         cut_off = mask[:, -1] & (tokens[:, -1] != END)
         return Samples(tokens, mask, logprobs[:, :length], texts, cut_off)
 
@@ -249,6 +251,7 @@ class TinyPolicy:
         folder.mkdir(parents=True, exist_ok=True)
         torch.save(self.module.state_dict(), folder / _WEIGHTS)
         description = {
+            "format": _FORMAT,
             "shape": asdict(self.module.shape),
             "words": self.vocabulary.words,
             "objects": self.vocabulary.object_words,
@@ -272,6 +275,11 @@ class TinyPolicy:
         LookupError if the description is damaged.
         """
         description = parse_json((folder / _DESCRIPTION).read_bytes())
+        if (found := description.get("format")) != _FORMAT:
+            raise ValueError(
+                f"{_DESCRIPTION} has the format {found or 1}, in which plans had other words: expected {_FORMAT}; train the "
+                "policy again"
+            )
         shape = DecoderShape(**description["shape"])
         words, objects, rooms = (tuple(map(str, description[part])) for part in ("words", "objects", "rooms"))
         vocabulary = Vocabulary(words, objects, rooms)

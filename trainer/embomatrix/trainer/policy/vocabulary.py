@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from embomatrix.skills.prompt import Situation
-from embomatrix.skills.syntax import PROFILES, PlaceRelation
+from embomatrix.skills.syntax import PROFILES, SIGNATURES, PlaceRelation
 from embomatrix.world.state import State
 from embomatrix.world.task import Profile
 
@@ -28,6 +28,9 @@ _WORD: Final = re.compile(r"\n|-?\d+\.\d+|[a-z0-9_]+(?:-[a-z][a-z0-9_]*)*|-\d+")
 _NUMBER: Final = re.compile(r"_\d+")
 _QUANTITY: Final = re.compile(r"-?\d+(?:\.\d+)?")
 _LONGEST_PHRASE: Final = 4
+_ARGUMENT_COUNTS: Final[Mapping[str, int]] = {
+    skill.value: len(arguments) for skill, arguments in SIGNATURES.items()
+}
 _MIN_COUNT: Final = 2
 """Occurrences of a word in the instructions that make it part of the vocabulary."""
 _FIXED_WORDS: Final = (
@@ -142,13 +145,24 @@ class Vocabulary:
             return frozenset()
         return frozenset(word for word in _WORD.findall(text.lower()) if UNKNOWN in self._word(word))
 
-    def decode(self, tokens: Iterable[int]) -> str:
-        """Decode up to the end token. Numbers join the word before: ``apple`` ``_2`` becomes ``apple_2``."""
-        parts: list[str] = []
+    def encode_plan(self, text: str) -> list[int]:
+        """Encode a plan. Its line breaks are left out, because each call ends with its last argument."""
+        return [token for token in self.encode(text) if token != self.index[BREAK]]
+
+    def decode_plan(self, tokens: Iterable[int]) -> str:
+        """Decode a plan up to the end token, one call a line. Numbers join the word before: ``apple`` ``_2`` is ``apple_2``."""
+        lines: list[str] = []
+        missing = 0  # arguments of the last call
         for token in tokens:
             if token == END:
                 break
             word = self.words[token]
-            no_space = word == BREAK or word.startswith("_") or not parts or parts[-1] == BREAK
-            parts += [word] if no_space else [" ", word]
-        return "".join(parts)
+            if lines and word.startswith("_"):
+                lines[-1] += word
+            elif lines and (missing or word not in _ARGUMENT_COUNTS):
+                lines[-1] += f" {word}"
+                missing = max(0, missing - 1)
+            else:
+                lines.append(word)
+                missing = _ARGUMENT_COUNTS.get(word, 0)
+        return "\n".join(lines)
