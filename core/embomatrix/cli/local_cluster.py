@@ -18,7 +18,7 @@ from embomatrix.host.parent import with_this_process
 MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})
 SERVER_PORTS: Final = range(20_000, 32_768)
 
-MEMORY_SHARE: Final = 0.2
+MEMORY_SHARE: Final = 0.1
 """Share of the free memory for the scenes of all workers together. The trainer and a person's other programs need the rest, and
 scenes that stay beyond the look-ahead are of no use before the next epoch: with 0.8, steps took twice as long after a while."""
 

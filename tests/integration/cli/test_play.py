@@ -125,7 +125,7 @@ def test_shipped_policy_plays_a_shipped_task(tmp_path):
     unpack(tmp_path)
     app = typer.Typer()
     app.command()(play)
-    words = "put the apple in the fridge"
+    words = "move the meat loaf into the fridge"
     result = CliRunner().invoke(
         app, [words, "--policy", "shipped", "--dataset", str(tmp_path)], env={"COLUMNS": "160"}
     )

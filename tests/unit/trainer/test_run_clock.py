@@ -5,6 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
+from embomatrix.cli.demo import EVALUATE_EVERY, GRPO_STEPS, IMITATION_STEPS
 from embomatrix.trainer.config.settings import EvaluationSettings
 from embomatrix.trainer.config.typical_times import evaluations_during, typical_seconds
 from embomatrix.trainer.imitation.teacher_forcing import ImitationProgress
@@ -99,8 +100,8 @@ def test_display_shows_the_time_of_the_whole_run_and_the_warning_beside_it():
 
 
 def test_demo_takes_the_minutes_that_the_readme_says():
-    settings = EvaluationSettings(every=70)
-    assert evaluations_during(settings, 420) == 5
-    assert evaluations_during(settings, 420, begun_at=141) == 3
-    assert evaluations_during(EvaluationSettings(), 420) == 0
-    assert 35 < typical_seconds(340, 420, 200 * (2 * 10 + 5 * 4)) / 60 <= 40
+    settings = EvaluationSettings(every=EVALUATE_EVERY)
+    assert evaluations_during(settings, GRPO_STEPS) == 1
+    assert evaluations_during(EvaluationSettings(every=70), 420, begun_at=141) == 3
+    assert evaluations_during(EvaluationSettings(), GRPO_STEPS) == 0
+    assert 15 < typical_seconds(IMITATION_STEPS, GRPO_STEPS, 200 * (2 * 10 + 1 * 4)) / 60 <= 16

@@ -206,7 +206,7 @@ def test_error_between_two_updates_is_visible():
 
 
 def test_cut_off_plans_are_masked_and_still_count_in_the_mean_of_their_group():
-    kept, masked = (Trial(max_new=14, overlong=each).take() for each in Overlong)
+    kept, masked = (Trial(max_new=40, overlong=each).take() for each in Overlong)
     assert 0 < kept.record.cut_off < 1
     assert kept.record.cut_off == masked.record.cut_off
     before, after = kept.learnt[0], masked.learnt[0]
@@ -214,7 +214,7 @@ def test_cut_off_plans_are_masked_and_still_count_in_the_mean_of_their_group():
     ended = after.mask.any(dim=1)
     assert torch.equal(after.mask, before.mask & ended[:, None])
     assert kept.record.cut_off == pytest.approx(1 - ended.float().mean().item())
-    assert set(lengths[~ended].tolist()) == {14}
+    assert set(lengths[~ended].tolist()) == {40}
     assert torch.equal(before.advantages, after.advantages)
     assert after.totals.tokens == after.mask.sum()
     assert after.totals.plans == PLANS

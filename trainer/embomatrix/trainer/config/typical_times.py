@@ -6,7 +6,7 @@ from typing import Final
 
 from embomatrix.trainer.config.settings import EvaluationSettings
 
-IMITATION_STEP_S: Final = 1.5
+IMITATION_STEP_S: Final = 0.6
 GRPO_STEP_S: Final = 3.8
 PLAN_S: Final = 0.02
 """Seconds of an imitation step, a GRPO step and an evaluated plan of the word-level policy on two cores.

@@ -1,11 +1,12 @@
 """Executed plan on the plan view of its scene. Each step is marked at its object's initial position."""
 
+import math
+from collections.abc import Sequence
 from typing import Final
 
 from embomatrix.pages.plan_view import OVERHEAD_M, PlanView
 from embomatrix.skills.syntax import Plan, SkillCall
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
-from embomatrix.world.geometry import Vec2
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
@@ -13,6 +14,16 @@ FIT_PX: Final = (560.0, 430.0)
 """Maximum width and height. Text keeps its size."""
 MIN_FURNITURE_M: Final = 0.3
 MARK_PX: Final = 9
+"""Radius of a step's mark."""
+_REACH: Final = 7
+_CELLS: Final = tuple(
+    sorted(
+        ((right, down) for right in range(-_REACH, _REACH + 1) for down in range(-_REACH, _REACH + 1)),
+        # To the right before below, and to the left last: numbers are read like a text.
+        key=lambda cell: math.hypot(cell[0], 1.5 * cell[1]) + (cell[0] < 0) + (cell[1] < 0) / 2,
+    )
+)
+"""Places for a mark around its object, the best first, in diameters."""
 
 
 def css_class(verdict: AnswerVerdict, number: int) -> str:
@@ -46,18 +57,22 @@ def plan_view(scene: Scene, task: Task, plan: Plan, verdict: AnswerVerdict) -> s
         view.line([start, *(point for _, point in marks)], "route"),
         f'<circle class="robot" cx="{x}" cy="{y}" r="6"><title>initial position of the robot</title></circle>',
     ]
-    marks_at: dict[Vec2, int] = {}
-    for number, point in marks:
-        # Marks at the same point stand side by side.
-        offset = marks_at.get(point, 0)
-        marks_at[point] = offset + 1
-        x, y = view.at(*point)
-        x += offset * 2 * MARK_PX
+    for (number, _), (x, y) in zip(marks, apart([view.at(*point) for _, point in marks]), strict=True):
         parts.append(
             f'<circle class="{css_class(verdict, number)}" cx="{x}" cy="{y}" r="{MARK_PX}"/>'
             f'<text class="number" x="{x}" y="{y + 4}" text-anchor="middle">{number}</text>'
         )
     return view.svg(parts, f"plan of {task.task_id} on the plan view")
+
+
+def apart(points: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return centres of marks near these points, in pixels, so that no mark covers another one if there is room nearby."""
+    taken: list[tuple[int, int]] = []
+    for x, y in points:
+        places = [(x + 2 * MARK_PX * right, y + 2 * MARK_PX * down) for right, down in _CELLS]
+        free = (place for place in places if all(math.dist(place, other) >= 2 * MARK_PX for other in taken))
+        taken.append(next(free, places[0]))
+    return taken
 
 
 def _objects(scene: Scene, task: Task, call: SkillCall) -> list[str]:
