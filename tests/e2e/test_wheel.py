@@ -127,7 +127,7 @@ def test_installed_wheel_plays_a_shipped_task_with_the_shipped_policy(environmen
         check=False,
     )
     assert played.returncode == 0, played.stderr
-    assert "move meat_loaf_1" in played.stdout
+    assert "toggle_on floor_lamp_1" in played.stdout
     assert "the text is a plan" in played.stdout
     where = "import embomatrix.cli, embomatrix.trainer; print(embomatrix.cli.__path__, embomatrix.trainer.__path__)"
     found = subprocess.run(

@@ -20,7 +20,8 @@ SERVER_PORTS: Final = range(20_000, 32_768)
 
 MEMORY_SHARE: Final = 0.1
 """Share of the free memory for the scenes of all workers together. The trainer and a person's other programs need the rest, and
-scenes that stay beyond the look-ahead are of no use before the next epoch: with 0.8, steps 20 to 40 of a demo took a quarter longer."""
+scenes that stay beyond the look-ahead are of no use before the next epoch. With 0.8, steps 20 to 40 of a demo took a quarter
+longer."""
 
 STOP_S: Final = 60.0
 """Time for an interrupted command to save its state."""

@@ -75,7 +75,7 @@ def test_unused_reserve_changes_nothing(tmp_path, kind):
         "grpo__steps": 2,
         "grpo__temperature": 1.5,
         "grpo__group": 10,  # this many plans of a task hardly ever earn equal rewards
-        "seed": 7,
+        "seed": 3,
     }
     _, plain = trained(tmp_path / "plain", **changes)
     _, reserved = trained(tmp_path / "reserved", grpo__reserve=1, **changes)

@@ -24,7 +24,7 @@ OnStep = Callable[[str], None]
 MOST_S: Final = 60.0
 EXTRAS: Final = ("worker", "trainer")
 """Extras of the wheel in the measurement."""
-PLAY: Final = ("play", "put the apple in the fridge", "--policy", SHIPPED)
+PLAY: Final = ("play", "turn on the floor lamp", "--policy", SHIPPED)
 LIMIT_S: Final = 600.0
 BUILD_TOOLS: Final = ("build", "hatchling", "hatch_vcs")
 

@@ -93,7 +93,7 @@ class Ruler:
             Codec.NAMES,
             shape.longest,
             lambda prompt: min(len(vocabulary.encode(prompt.user)), longest_prompt(shape)) + 1,
-            lambda text: len(vocabulary.encode(text)) + 1,
+            lambda text: len(vocabulary.encode_plan(text)) + 1,
             vocabulary.unknown_words,
         )
 

@@ -275,6 +275,8 @@ class TinyPolicy:
         LookupError if the description is damaged.
         """
         description = parse_json((folder / _DESCRIPTION).read_bytes())
+        if not isinstance(description, dict):
+            raise ValueError(f"{_DESCRIPTION} holds {type(description).__name__}: expected a table")
         if (found := description.get("format")) != _FORMAT:
             raise ValueError(
                 f"{_DESCRIPTION} has the format {found or 1}, in which plans had other words: expected {_FORMAT}; train the "
