@@ -131,6 +131,12 @@ def test_word_level_parameters_are_those_of_the_network(changes):
     assert counted.matrices == sum(matrix.numel() for matrix in _matrices(network))
 
 
+def test_without_a_kl_term_there_is_no_reference():
+    without, full = plan(grpo__kl_coef=0.0), plan()
+    assert {parts[Part.REFERENCE] for parts in without.parts.values()} == {0}
+    assert full.total(Phase.UPDATE) - without.total(Phase.UPDATE) == 4000
+
+
 def test_imitation_has_no_reference_and_muon_one_moment():
     parts = plan(imitation__patience=2).parts[Phase.IMITATION]
     assert parts[Part.REFERENCE] == 0

@@ -105,7 +105,7 @@ def plan_memory(settings: TrainSettings, footprint: Footprint, lengths: Lengths)
         "weights": footprint.weights,
         "gradients": gradients,  # a step's gradients live until the next update begins
         "optimiser": moments,
-        "reference": footprint.reference,
+        "reference": footprint.reference if grpo.kl_coef else 0,
     }
     samples = max(evaluation.samples, evaluation.samples_during if evaluation.every else 0)
     usage = footprint.sampled(Batch(evaluation.chunk, samples, lengths.prompt, new))

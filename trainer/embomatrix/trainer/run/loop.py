@@ -31,7 +31,6 @@ from embomatrix.trainer.logging.outcome import RunOutcome, write_outcome
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
 from embomatrix.trainer.logging.report import REPORT, TrainedOn, TrainingSummary, rates_of, write_report
 from embomatrix.trainer.logging.trackers import Tracker
-from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.run.imitation import run_imitation
 from embomatrix.trainer.run.starting import REFERENCE, RunStart
 from embomatrix.trainer.serving.sampler import ServerSampler
@@ -76,8 +75,11 @@ class TrainingRun:
         began_s = time.monotonic()
         earlier_s = sum(self._progress.spent_s.values())
         with DataParallelWorkers.start(self._start.policy, self._settings) as workers:
-            reference = self._start.reference or self._prepare(workers)
-            workers.use_reference(reference, self._out / REFERENCE)
+            if not self._progress.grpo_ready:
+                self._prepare(workers)
+            if self._settings.grpo.kl_coef:
+                reference = self._start.reference or self._start.policy.frozen_copy()
+                workers.use_reference(reference, self._out / REFERENCE)
             checkpoint = self._grpo(workers)
             after = self._evaluate(AFTER, self._settings.evaluation.samples, workers)
         summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
@@ -115,8 +117,8 @@ class TrainingRun:
         updater.optimiser.load_state_dict(tensors["optimiser"])
         self._generator.set_state(tensors["generator"])
 
-    def _prepare(self, workers: DataParallelWorkers) -> Policy:
-        """Run imitation and the first evaluation. Return the reference policy, a copy of the policy."""
+    def _prepare(self, workers: DataParallelWorkers) -> None:
+        """Run imitation and the first evaluation, and save the reference policy."""
         policy, progress = self._start.policy, self._progress
         with self._stopwatch.track(Activity.IMITATION):
             run_imitation(self._start, workers, self._out, self._recorder, self._display.imitation)
@@ -126,7 +128,6 @@ class TrainingRun:
         with atomic_folder(self._out / REFERENCE) as folder:
             policy.save(folder)
         progress.grpo_ready = True
-        return policy.frozen_copy()
 
     def _evaluate(self, label: str, samples: int, workers: DataParallelWorkers) -> HeldOutEvaluation | None:
         start, settings, step = self._start, self._settings, self._progress.step

@@ -74,7 +74,8 @@ AFTER_IMITATION: Final = ("grpo.", "reward.", "evaluation.")
 class RunStart:
     """Everything a run starts with.
 
-    ``progress`` comes from the checkpoint of a resumed run. ``reference`` is the policy after imitation, None until then.
+    ``progress`` comes from the checkpoint of a resumed run. ``reference`` is the policy after imitation, None
+    until then and without a KL term.
     """
 
     settings: TrainSettings
@@ -222,7 +223,8 @@ def resume_run(
             "or start a new run with another --out"
         )
     policy = saved_policy(newest / "policy", settings)
-    reference = saved_policy(out / REFERENCE, settings).frozen_copy() if progress.grpo_ready else None
+    has_reference = progress.grpo_ready and settings.grpo.kl_coef
+    reference = saved_policy(out / REFERENCE, settings).frozen_copy() if has_reference else None
     return RunStart(settings, tasks, policy, progress, reference)
 
 
