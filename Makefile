@@ -10,7 +10,7 @@ ARGS ?=
 
 DEFAULT_TESTS := not slow and not docker and not hf and not eai and not peers
 
-.PHONY: run test test-unit test-slow test-random test-random-hour fuzz house lint types contracts proto proto-check check site diagrams compose-check wheel pictures clean
+.PHONY: run test test-unit test-slow test-random test-random-hour fuzz house lint types contracts proto proto-check check site diagrams compose-check wheel physics-wheel pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
@@ -83,6 +83,10 @@ compose-check: $(VENV)/.dev
 wheel: $(VENV)/.dev
 	rm -rf build/dist
 	$(BIN)/python -m build --no-isolation --outdir build/dist
+
+# PyBullet for a Python without a wheel on the index: `make physics-wheel PYTHON=python3.12`. Needs a C++ compiler.
+physics-wheel:
+	deploy/physics/build_wheel.sh $(PYTHON) build/dist
 
 pictures: $(VENV)/.dev
 	$(BIN)/embomatrix scene draw Rs_int Wainscott_0_int restaurant_diner --format jpg --out docs/pictures --force
