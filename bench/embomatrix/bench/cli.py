@@ -124,12 +124,20 @@ def trainer(
             envvar="EMBOMATRIX_TRL",
         ),
     ] = None,
+    gpu: Annotated[
+        bool,
+        typer.Option(
+            "--gpu",
+            help="Measure full fine-tuning of a random model of 1.5 billion weights on a GPU instead.",
+        ),
+    ] = False,
 ) -> None:
     """Measure a GRPO step, the time shares of a short run, and an evaluation of stored answers."""
-    from embomatrix.bench.trainer.measure import bench_trainer
+    from embomatrix.bench.trainer.measure import bench_gpu_trainer, bench_trainer
 
+    bench = bench_gpu_trainer if gpu else bench_trainer
     with refusals(json_file):
-        hand_in(_measured("trainer", lambda on_step: bench_trainer(dataset, trl, on_step)), json_file)
+        hand_in(_measured("trainer", lambda on_step: bench(dataset, trl, on_step)), json_file)
 
 
 @app.command()

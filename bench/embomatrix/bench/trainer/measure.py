@@ -50,6 +50,16 @@ def bench_trainer(dataset: Path, trl: Path | None, on_step: Callable[[str], None
         return (*steps, *_run(dataset, folder, on_step), *_evaluation(dataset, folder, on_step))
 
 
+def bench_gpu_trainer(dataset: Path, trl: Path | None, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+    """Measure steps of a large model with random weights on a GPU. ``trl`` and errors as for ``bench_trainer``."""
+    if find_spec("transformers") is None:
+        raise BenchError("transformers is missing: `pip install 'embomatrix[hf]'`")
+    from embomatrix.bench.trainer.gpu import bench_gpu
+
+    with tempfile.TemporaryDirectory(prefix="embo-") as name:
+        return bench_gpu(dataset, trl, Path(name), on_step)
+
+
 def measure_steps(
     dataset: Path, trl: Path | None, folder: Path, on_step: Callable[[str], None]
 ) -> list[Figure]:

@@ -22,7 +22,7 @@ from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
 
-class _LongPlanLearner(Learner):
+class LongPlanLearner(Learner):
     """Learner that gives all plans of a microbatch the tokens of its longest one, because the plan assumes long plans.
 
     It remembers the longest prompt and the longest plan.
@@ -52,7 +52,7 @@ def plan_error(
     one creates the optimiser state.
     """
     reference = policy.frozen_copy()
-    learner = _LongPlanLearner(policy, reference, settings.grpo)
+    learner = LongPlanLearner(policy, reference, settings.grpo)
     builder = PromptBuilder(policy, settings.prompt.rows, Variation({}, rename=0.0, drop=0.0))
     updater = Updater(
         policy, DataParallelWorkers(learner), builder, LengthScore(), settings.grpo, Stopwatch()

@@ -43,7 +43,8 @@ ROWS: Final = 16
 class Load:
     """A step samples ``group`` plans of ``new`` tokens for each of ``tasks`` prompts and learns from all of them.
 
-    ``words`` are the vocabulary. ``steps`` are measured after ``unmeasured`` ones, in which libraries warm up.
+    ``words`` are the vocabulary. ``steps`` are measured after ``unmeasured`` ones, in which libraries warm up. TRL
+    back-propagates ``microbatch`` plans at once, 0 for all.
     """
 
     prompts: tuple[str, ...]
@@ -56,7 +57,10 @@ class Load:
     layers: int = 4
     width: int = 256
     heads: int = 4
+    key_value_heads: int = 4
     inner: int = 672
+    microbatch: int = 0
+    device: str = "cpu"
     seed: int = 0
 
 
@@ -131,7 +135,10 @@ def policy_of(load: Load) -> HfPolicy:
 
 
 def trl_step_s(load: Load, python: Path, folder: Path) -> list[float]:
-    """CPU seconds of each of TRL's measured steps; ``python`` is the interpreter of its environment. Raise BenchError."""
+    """CPU seconds of each of TRL's measured steps, on a GPU wall seconds. Raise BenchError.
+
+    ``python`` is the interpreter of its environment.
+    """
     path = folder / "load.json"
     path.write_text(json.dumps(asdict(load)), encoding="utf-8")
     spec = find_spec("embomatrix.bench.trainer.trl_steps")

@@ -2,8 +2,8 @@
 
     PYTHON trl_steps.py LOAD
 
-It writes the CPU seconds of each step as JSON on the last line of standard output. Groups, lengths, loss, batch, model and
-reward are those of our own steps.
+It writes the CPU seconds of each step, on a GPU the wall seconds, as JSON on the last line of standard output. Groups,
+lengths, loss, batch, model and reward are those of our own steps.
 """
 
 import json
@@ -18,24 +18,32 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 
 def measure(load: dict[str, Any]) -> list[float]:
-    """CPU seconds of each measured step."""
+    """CPU seconds of each measured step, on a GPU wall seconds."""
     import torch
     from datasets import Dataset
     from transformers import TrainerCallback
     from trl import GRPOTrainer
 
+    on_gpu = load["device"] != "cpu"
+
+    def now_s() -> float:
+        if not on_gpu:
+            return time.process_time()
+        torch.cuda.synchronize()
+        return time.perf_counter()
+
     class Clock(TrainerCallback):
-        """Reads the CPU clock around each step."""
+        """Reads the clock around each step."""
 
         def __init__(self) -> None:
             self.began_s = 0.0
             self.spent_s: list[float] = []
 
         def on_step_begin(self, *_: Any, **__: Any) -> None:
-            self.began_s = time.process_time()
+            self.began_s = now_s()
 
         def on_step_end(self, *_: Any, **__: Any) -> None:
-            self.spent_s.append(time.process_time() - self.began_s)
+            self.spent_s.append(now_s() - self.began_s)
 
     torch.set_num_threads(1)
     torch.manual_seed(load["seed"])
@@ -84,7 +92,7 @@ def model_of(load: dict[str, Any]) -> Any:
             intermediate_size=load["inner"],
             num_hidden_layers=load["layers"],
             num_attention_heads=load["heads"],
-            num_key_value_heads=load["heads"],
+            num_key_value_heads=load["key_value_heads"],
             max_position_embeddings=2048,
             tie_word_embeddings=True,
             eos_token_id=1,
@@ -96,17 +104,20 @@ def model_of(load: dict[str, Any]) -> Any:
 def _settings(load: dict[str, Any], folder: str) -> Any:
     from trl import GRPOConfig
 
+    plans, on_gpu = load["tasks"] * load["group"], load["device"] != "cpu"
+    at_once = load["microbatch"] or plans
     return GRPOConfig(
         output_dir=folder,
-        per_device_train_batch_size=load["tasks"] * load["group"],
+        per_device_train_batch_size=at_once,
+        gradient_accumulation_steps=plans // at_once,
         num_generations=load["group"],
         max_completion_length=load["new"],
         max_steps=load["unmeasured"] + load["steps"],
         loss_type="dapo",
         beta=0.0,
         temperature=1.0,
-        use_cpu=True,
-        bf16=False,
+        use_cpu=not on_gpu,
+        bf16=on_gpu,
         gradient_checkpointing=False,
         save_strategy="no",
         report_to="none",
