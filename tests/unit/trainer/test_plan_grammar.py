@@ -11,7 +11,7 @@ from tests.fakes.symbolic_household import make_tasks
 from embomatrix.skills.prompt import Codec, PromptRow, plan_in_names, prompt_for
 from embomatrix.skills.syntax import PROFILES
 from embomatrix.trainer.cluster.gateway import parse_policy_text
-from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.decoder import DecoderShape, Shortlist
 from embomatrix.trainer.policy.grammar import PlanGrammar
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import END, build_vocabulary
@@ -50,7 +50,7 @@ def next_words(situation, written):
     names = GRAMMAR.prompt_names(torch.tensor([prompt_of(situation)]))
     state = GRAMMAR.start(1)
     for token in WORDS.encode(written):
-        state = GRAMMAR.advance(state, torch.tensor([token]))
+        state = GRAMMAR.advance(state, torch.tensor([token]), names)
     token_mask = GRAMMAR.token_mask(state, names)[0]
     return {WORDS.words[token] for token in (~token_mask).nonzero()[:, 0].tolist()}
 
@@ -75,7 +75,7 @@ def test_room_with_a_number_in_instructions_can_be_reached():
     words = build_vocabulary([situation], [f"Put the apple away in {room}."] * 3)
     grammar = PlanGrammar(words, torch.device("cpu"))
     names = grammar.prompt_names(torch.tensor([words.encode(prompt_for(situation, Codec.NAMES).user)]))
-    state = grammar.advance(grammar.start(1), torch.tensor([words.index["go_to_room"]]))
+    state = grammar.advance(grammar.start(1), torch.tensor([words.index["go_to_room"]]), names)
     allowed = {
         words.words[token] for token in (~grammar.token_mask(state, names)[0]).nonzero()[:, 0].tolist()
     }
@@ -90,7 +90,7 @@ def test_oracle_plans_are_never_masked(task):
     state = GRAMMAR.start(1)
     for token in tokens[0]:
         assert not GRAMMAR.token_mask(state, names)[0, token]
-        state = GRAMMAR.advance(state, token[None])
+        state = GRAMMAR.advance(state, token[None], names)
 
 
 def test_only_skills_can_start_a_call():
@@ -117,7 +117,7 @@ def test_vocabulary_of_an_older_checkpoint_offers_the_relations_that_it_has():
     names = grammar.prompt_names(torch.tensor([prompt]))
     state = grammar.start(1)
     for token in older.encode(f"place {situation.rows[0].category}"):
-        state = grammar.advance(state, torch.tensor([token]))
+        state = grammar.advance(state, torch.tensor([token]), names)
     allowed = (~grammar.token_mask(state, names)[0]).nonzero()[:, 0].tolist()
     assert {older.words[token] for token in allowed} == {"ontop", "inside", "under"}
 
@@ -154,3 +154,31 @@ def test_invalid_plan_still_has_a_likelihood(written):
 def test_empty_prompt_allows_only_the_end_token():
     situation = replace(TASKS.train[0].situation, rows=(), rooms=())
     assert next_words(situation, "move") == {"<end>"}
+
+
+def coverage_after(situation, written):
+    """Return the coverage above 0 of the words that may follow this text in its prompt."""
+    names = GRAMMAR.prompt_names(torch.tensor([prompt_of(situation)]))
+    shortlist = Shortlist.of(GRAMMAR.words(names))
+    state = GRAMMAR.start(1)
+    for token in WORDS.encode(written):
+        state = GRAMMAR.advance(state, torch.tensor([token]), names)
+    values = GRAMMAR.coverage(state, names, shortlist)[0]
+    allowed = ~GRAMMAR.token_mask(state, names)[0][shortlist.words]
+    return {
+        WORDS.words[int(shortlist.words[at])]: float(values[at])
+        for at in (allowed & (values > 0)).nonzero()[:, 0]
+    }
+
+
+def test_things_that_were_picked_up_are_covered():
+    situation = TWINS
+    twin, alone = situation.rows[-1].category, situation.rows[0].category
+    assert coverage_after(situation, f"move {twin}_3 move") == {}
+    assert coverage_after(situation, f"pick_up {twin}_3 move") == {twin: 0.5}
+    assert coverage_after(situation, f"pick_up {twin}_3 move {twin}") == {"_3": 1.0}
+    assert coverage_after(situation, f"pick_up {twin}_3 pick_up {twin}_7 move") == {twin: 1.0}
+    assert coverage_after(situation, f"pick_up {alone} move") == {alone: 1.0}
+    assert coverage_after(situation, f"pick_up {twin}_3 pick_up {twin}_3 pick_up {twin}_3 move") == {
+        twin: 1.0
+    }

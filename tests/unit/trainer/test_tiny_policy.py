@@ -274,7 +274,7 @@ def test_policy_of_an_older_version_is_refused(tmp_path):
     description = json.loads(path.read_text())
     del description["format"]
     path.write_text(json.dumps(description))
-    with pytest.raises(TrainerError, match=r"format 1.*expected 2; train the policy again"):
+    with pytest.raises(TrainerError, match=r"format 1.*expected 3; train the policy again"):
         saved_policy(tmp_path, TrainSettings())
 
 

@@ -25,6 +25,8 @@ _MASKED = -1e9
 _MIN_PROBABILITY = 1e-9
 _INITIAL_PREVIOUS_SHARE = 0.3
 """Initial share of the previous word's embedding."""
+_INITIAL_COVERAGE_WEIGHT = -1.0
+"""Initial change of the score of words for things that the plan has picked up before: once is usually enough."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +184,7 @@ class Decoder(nn.Module):
         self.pointer_query = nn.Linear(shape.width, shape.width, bias=False)
         self.pointer_key = nn.Linear(shape.width, shape.width, bias=False)
         self.pointer_gate = nn.Linear(shape.width, 1)
+        self.coverage_weight = nn.Linear(shape.width, 1)
         half = shape.width // shape.heads // 2
         angles = torch.outer(torch.arange(shape.longest).float(), 10000.0 ** (-torch.arange(half) / half))
         self.register_buffer("cos", angles.cos().repeat(1, 2), persistent=False)
@@ -192,6 +195,7 @@ class Decoder(nn.Module):
             if name.endswith(("out.weight", "down.weight")):
                 parameter.data /= (2 * shape.layers) ** 0.5
         nn.init.zeros_(self.pointer_gate.bias)
+        nn.init.constant_(self.coverage_weight.bias, _INITIAL_COVERAGE_WEIGHT)
 
     def scores(
         self,
@@ -200,11 +204,13 @@ class Decoder(nn.Module):
         plan: PlanCache | None,
         shortlist: Shortlist,
         token_mask: Tensor,
+        coverage: Tensor,
     ) -> Tensor:
         """Log scores (Q * G, T, K) of the shortlist as next words for hidden states (Q * G, T, C).
 
         The hidden states are the last T of those after the prompt and after each word of ``plan``. ``token_mask``
-        (Q * G, T, K) is true on words to exclude.
+        (Q * G, T, K) is true on words to exclude. ``coverage`` (Q * G, T, K) is 1 on words that lead to things which the plan
+        has picked up before; each state decides how much that counts.
         """
         x = self.norm(states)
         weight = self.embedding.weight[shortlist.words]
@@ -213,7 +219,8 @@ class Decoder(nn.Module):
         pointed = torch.zeros_like(generated).scatter_add(2, columns, attention)
         gate = torch.sigmoid(self.pointer_gate(x))  # (Q G, T, 1)
         mixed = torch.lerp(generated, pointed, gate)
-        return mixed.clamp(min=_MIN_PROBABILITY).log().masked_fill(token_mask, _MASKED)
+        scores = mixed.clamp(min=_MIN_PROBABILITY).log() + self.coverage_weight(x) * coverage
+        return scores.masked_fill(token_mask, _MASKED)
 
     def _point(
         self,

@@ -396,7 +396,8 @@ class WordLevelFootprint:
     def learning(self) -> int:
         shape = self.shape
         norms = 2 * shape.width + 2 * shape.width // shape.heads
-        rest = (shape.vocabulary + 3) * shape.width + 1  # embedding, share of the previous word, norm, gate
+        # embedding, share of the previous word, norm, weights and biases of gate and coverage
+        rest = (shape.vocabulary + 4) * shape.width + 2
         return self.matrices + shape.layers * norms + rest
 
     @property

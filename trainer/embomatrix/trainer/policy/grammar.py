@@ -16,7 +16,8 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from embomatrix.skills.syntax import SIGNATURES, Arg, PlaceRelation
+from embomatrix.skills.syntax import SIGNATURES, Arg, PlaceRelation, Skill
+from embomatrix.trainer.policy.decoder import Shortlist
 from embomatrix.trainer.policy.vocabulary import BREAK, END, PAD, Vocabulary
 
 
@@ -47,30 +48,38 @@ class PromptNames:
     """Names of objects and rooms in a batch of prompts.
 
     ``stems`` (Q, 2, V): first words of object names and of room names. ``unnumbered`` (Q, V): first words that are complete
-    names. ``numbers`` (Q, V, N): number words that may follow a first word.
+    names. ``numbers`` (Q, V, N): number words that may follow a first word. ``share`` (Q, V): one name's share of the names
+    with a first word, 1 for words that begin no name.
     """
 
     stems: Tensor
     unnumbered: Tensor
     numbers: Tensor
+    share: Tensor
 
     def select(self, prompts: Tensor) -> PromptNames:
         """Names of the prompts with these indices (R,). Indices may repeat."""
-        return PromptNames(self.stems[prompts], self.unnumbered[prompts], self.numbers[prompts])
+        return PromptNames(
+            self.stems[prompts], self.unnumbered[prompts], self.numbers[prompts], self.share[prompts]
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class GrammarState:
     """Position in each plan, all (R,): skill of the last call (PAD: none), number of its arguments so far, and the stem of a
     name that may still get a number (PAD: none). A call ends with its last argument: the next word is a skill or the end.
+
+    ``taken`` (R, S, 2): stem and number of the thing that each of the S words so far completes as one to be picked up. PAD
+    for all other words, and for the number of an unnumbered name.
     """
 
     skill: Tensor
     arguments: Tensor
     open_stem: Tensor
+    taken: Tensor
 
     def select(self, rows: Tensor) -> GrammarState:
-        return GrammarState(self.skill[rows], self.arguments[rows], self.open_stem[rows])
+        return GrammarState(self.skill[rows], self.arguments[rows], self.open_stem[rows], self.taken[rows])
 
 
 class PlanGrammar:
@@ -79,6 +88,7 @@ class PlanGrammar:
     def __init__(self, vocabulary: Vocabulary, device: torch.device) -> None:
         size, index = len(vocabulary), vocabulary.index
         self._break, self._task = index[BREAK], index["task"]
+        self._pick_up = index.get(Skill.PICK_UP.value, PAD)
         self._numbers = torch.tensor(vocabulary.number_tokens, dtype=torch.long, device=device)  # (N,)
         self._number_index = torch.full((size,), -1, device=device)
         self._number_index[self._numbers] = torch.arange(len(self._numbers), device=device)
@@ -117,7 +127,8 @@ class PlanGrammar:
             stems[row, kind, word] = True
             unnumbered[row[follows < 0], word[follows < 0]] = True
             numbers[row[follows >= 0], word[follows >= 0], follows[follows >= 0]] = True
-        return PromptNames(stems, unnumbered, numbers)
+        share = 1 / (numbers.sum(dim=2) + unnumbered).clamp(min=1)
+        return PromptNames(stems, unnumbered, numbers, share)
 
     def words(self, names: PromptNames) -> Tensor:
         """Return the mask (V,) of the words that plans for these prompts can contain."""
@@ -129,10 +140,10 @@ class PlanGrammar:
     def start(self, rows: int) -> GrammarState:
         """State of empty plans."""
         nothing = torch.full((rows,), PAD, device=self._number_index.device)
-        return GrammarState(nothing, torch.zeros_like(nothing), nothing)
+        return GrammarState(nothing, torch.zeros_like(nothing), nothing, nothing.new_zeros(rows, 0, 2))
 
-    def advance(self, state: GrammarState, tokens: Tensor) -> GrammarState:
-        """State after one more token of each plan (R,)."""
+    def advance(self, state: GrammarState, tokens: Tensor, names: PromptNames) -> GrammarState:
+        """State after one more token of each plan (R,). ``names`` belong to each row's prompt."""
         argument = self._arguments[state.skill, state.arguments]
         joins = self._number_index[tokens] >= 0
         begins = ~joins & ((argument == _Expects.SKILL) | (argument == _Expects.CALL_END))
@@ -141,7 +152,29 @@ class PlanGrammar:
         skill = torch.where(begins, tokens, state.skill)
         arguments = (state.arguments + fills).masked_fill(begins, 0)
         open_stem = torch.where(fills & named, tokens, PAD)
-        return GrammarState(skill, arguments, open_stem)
+        rows = torch.arange(len(tokens), device=tokens.device)
+        numbered = joins & (state.skill == self._pick_up)
+        alone = fills & (state.skill == self._pick_up) & names.unnumbered[rows, tokens]
+        stem = torch.where(numbered, state.open_stem, torch.where(alone, tokens, PAD))
+        taken = torch.stack([stem, torch.where(numbered, tokens, PAD)], dim=1)[:, None]
+        return GrammarState(skill, arguments, open_stem, torch.cat([state.taken, taken], dim=1))
+
+    def coverage(self, state: GrammarState, names: PromptNames, shortlist: Shortlist) -> Tensor:
+        """Return how far each word of a shortlist (R, K) leads to things that the plan has picked up before, 0 to 1.
+
+        For a number it is 1 if the plan picked up the thing of that name. For a first word it is the share of the prompt's
+        things of that word, if a call expects an object next.
+        """
+        stems, numbers = state.taken.unbind(dim=2)  # (R, S)
+        rows = torch.arange(len(stems), device=stems.device)[:, None]
+        expects_object = self._arguments[state.skill, state.arguments] == _Expects.OBJECT
+        again = (stems == state.open_stem[:, None]) & (stems != PAD)
+        columns = shortlist.columns
+        found = torch.zeros(len(stems), len(shortlist.words), device=stems.device)
+        found.scatter_add_(1, columns[stems], names.share[rows, stems] * expects_object[:, None])
+        found.scatter_add_(1, columns[numbers], again.float())
+        found[:, columns[PAD]] = 0.0
+        return found.clamp_(max=1.0)
 
     def token_mask(self, state: GrammarState, names: PromptNames) -> Tensor:
         """Return the words (R, V) that must not come next. ``names`` belong to each row's prompt.
@@ -159,15 +192,18 @@ class PlanGrammar:
         allowed[:, END] |= ~allowed.any(dim=1)
         return ~allowed
 
-    def token_masks(self, tokens: Tensor, names: PromptNames, words: Tensor) -> Tensor:
-        """Return which of ``words`` (K,) are masked at each position of plans (R, T): (R, T, K).
+    def rules_of_plans(
+        self, tokens: Tensor, names: PromptNames, shortlist: Shortlist
+    ) -> tuple[Tensor, Tensor]:
+        """Return which words of a shortlist are masked at each position of plans (R, T), and their coverage: (R, T, K) each.
 
         The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood.
         """
         state = self.start(len(tokens))
-        masks = []
+        masks, coverages = [], []
         for at in range(tokens.shape[1]):
             mask = self.token_mask(state, names)
-            masks.append(mask.scatter_(1, tokens[:, at, None], False)[:, words])
-            state = self.advance(state, tokens[:, at])
-        return torch.stack(masks, dim=1)
+            masks.append(mask.scatter_(1, tokens[:, at, None], False)[:, shortlist.words])
+            coverages.append(self.coverage(state, names, shortlist))
+            state = self.advance(state, tokens[:, at], names)
+        return torch.stack(masks, dim=1), torch.stack(coverages, dim=1)

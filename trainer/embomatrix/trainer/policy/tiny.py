@@ -37,8 +37,8 @@ _MIN_LOGPROB = -80.0
 """Lower log-probabilities do not change an entropy, and their exponentials (denormal floats) take ten times as long."""
 _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
-_FORMAT: Final = 2
-"""Version of a saved policy's words. Plans of version 1 had a word between two calls."""
+_FORMAT: Final = 3
+"""Version of a saved policy. Plans of version 1 had a word between two calls; version 2 had no coverage."""
 MAX_CONTEXT: Final = 65_536
 """Tokens of the longest context of a saved policy."""
 
@@ -65,7 +65,7 @@ class _SamplingState:
         return replace(
             self,
             active=self.active & (choice != END),
-            grammar_state=grammar.advance(self.grammar_state, choice),
+            grammar_state=grammar.advance(self.grammar_state, choice, self.names),
         )
 
     def rows_to_keep(self) -> Tensor:
@@ -149,7 +149,10 @@ class TinyPolicy:
             for at in range(max_new):
                 words = state.shortlist.words
                 token_mask = self._grammar.token_mask(state.grammar_state, state.names)[:, None, words]
-                scores = self.module.scores(hidden, state.prompts, state.plan, state.shortlist, token_mask)
+                coverage = self._grammar.coverage(state.grammar_state, state.names, state.shortlist)[:, None]
+                scores = self.module.scores(
+                    hidden, state.prompts, state.plan, state.shortlist, token_mask, coverage
+                )
                 column, logprob = draw(scores[:, 0], temperature, generator)
                 choice = words[column]
                 rows, active = state.rows, state.active
@@ -197,7 +200,7 @@ class TinyPolicy:
         included = self._grammar.words(names)
         included[tokens] = True  # other sources' plans may break the grammar
         shortlist = Shortlist.of(included)
-        token_masks = self._grammar.token_masks(tokens, names.select(prompt_of_row), shortlist.words)
+        token_masks, coverages = self._grammar.rules_of_plans(tokens, names.select(prompt_of_row), shortlist)
         lengths = mask.sum(dim=1)
         order = torch.argsort(lengths, stable=True)
         scores = []
@@ -210,6 +213,7 @@ class TinyPolicy:
                     tokens[rows, :length],
                     shortlist,
                     token_masks[rows, :length],
+                    coverages[rows, :length],
                     temperature,
                     entropy_gradient,
                 )
@@ -228,16 +232,19 @@ class TinyPolicy:
         tokens: Tensor,
         shortlist: Shortlist,
         token_masks: Tensor,
+        coverages: Tensor,
         temperature: float,
         entropy_gradient: bool,
     ) -> tuple[Tensor, Tensor]:
-        """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks: (rows, T, K)."""
+        """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks, coverages: (rows, T, K)."""
         hidden, plan = prompts.last, None  # (rows, 1, C)
         if tokens.shape[1] > 1:
             rest, plan = self.module.extend(prompts, tokens[:, :-1], None)
             hidden = torch.cat([hidden, rest], dim=1)  # (rows, T, C)
         scores = torch.log_softmax(
-            self.module.scores(hidden, prompts, plan, shortlist, token_masks) / (temperature or 1.0), dim=-1
+            self.module.scores(hidden, prompts, plan, shortlist, token_masks, coverages)
+            / (temperature or 1.0),
+            dim=-1,
         )  # (rows, T, K)
         chosen = scores.gather(-1, shortlist.columns[tokens][..., None])[..., 0]
         return chosen, token_entropy(scores, gradient=entropy_gradient, minimum=_MIN_LOGPROB)
@@ -279,7 +286,7 @@ class TinyPolicy:
             raise ValueError(f"{_DESCRIPTION} holds {type(description).__name__}: expected a table")
         if (found := description.get("format")) != _FORMAT:
             raise ValueError(
-                f"{_DESCRIPTION} has the format {found or 1}, in which plans had other words: expected {_FORMAT}; train the "
+                f"{_DESCRIPTION} has the format {found or 1}, of an older version: expected {_FORMAT}; train the "
                 "policy again"
             )
         shape = DecoderShape(**description["shape"])
