@@ -196,7 +196,7 @@ def test_smollm2_can_write_the_shipped_plans_within_the_default_of_every_model(s
         assert expressibility(tasks, limits, ruler).inexpressible == 0
     former = expressibility(shipped.train, Limits(28, 96), ruler)
     assert former.share > 0.5
-    assert set(former.obstacles) == {Obstacle.LENGTH}
+    assert Obstacle.LENGTH in former.obstacles
 
 
 @pytest.mark.hf

@@ -6,7 +6,7 @@ Random weights cost as much memory and time as trained ones. Their plans seldom 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
@@ -40,14 +40,6 @@ LEARNING_RATE: Final = 1e-5
 LEARNING_STEPS: Final = 6
 """Steps after which the changed weights are counted. The first one, in which the GPU warms up, is not timed."""
 VOCABULARY: Final = 151_936
-QWEN_1_5B: Final = {
-    "layers": 28,
-    "width": 1_536,
-    "heads": 12,
-    "key_value_heads": 2,
-    "inner": 8_960,
-}
-"""Shape of Qwen2.5-1.5B, from its published configuration."""
 
 
 def bench_gpu(
@@ -79,18 +71,25 @@ def bench_gpu(
     )
 
 
-def gpu_load(tasks: Sequence[TrainingTask], shape: Mapping[str, int] = QWEN_1_5B, new: int = 256) -> Load:
-    """The load of these tasks' prompts for a large model. Words that stand for nothing fill its vocabulary."""
+def gpu_load(tasks: Sequence[TrainingTask]) -> Load:
+    """The load of these tasks' prompts for a model with the shape of Qwen2.5-1.5B, from its published configuration.
+
+    Words that stand for nothing fill its vocabulary.
+    """
     load = load_of(tasks)
     fillers = (f"w{number}" for number in range(VOCABULARY - len(load.words)))
     return replace(
         load,
         words=(*load.words, *fillers),
+        layers=28,
+        width=1_536,
+        heads=12,
+        key_value_heads=2,
+        inner=8_960,
         device="cuda",
-        new=new,
+        new=256,
         microbatch=8,
         steps=LEARNING_STEPS - 1,
-        **shape,
     )
 
 

@@ -219,7 +219,8 @@ class Decoder(nn.Module):
         pointed = torch.zeros_like(generated).scatter_add(2, columns, attention)
         gate = torch.sigmoid(self.pointer_gate(x))  # (Q G, T, 1)
         mixed = torch.lerp(generated, pointed, gate)
-        scores = mixed.clamp(min=_MIN_PROBABILITY).log() + self.coverage_weight(x) * coverage
+        penalty: Tensor = self.coverage_weight(x) * coverage
+        scores = mixed.clamp(min=_MIN_PROBABILITY).log() + penalty
         return scores.masked_fill(token_mask, _MASKED)
 
     def _point(
