@@ -43,7 +43,7 @@ def pybullet() -> Any:
     except ImportError as error:
         raise EngineMissingError(
             "the physics engine is missing: expected the package pybullet 3.2.7, which has wheels for Python up to "
-            "3.11 on x86-64 Linux; install embomatrix[worker] there"
+            "3.11 on x86-64 Linux; install embomatrix[worker] there, or build a wheel in a clone with `make physics-wheel`"
         ) from error
     return module
 
