@@ -19,6 +19,7 @@ from embomatrix.trainer.commands.eai import _read as read_eai_answers
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import ServerKind, TrainSettings, read_settings
 from embomatrix.trainer.eai.sanitise import sanitise_answer
+from embomatrix.trainer.episodes.oracle import read_episodes
 from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
 from embomatrix.trainer.evaluation.answers import _read as read_answers
 from embomatrix.trainer.evaluation.benchmark import IMPORT_REPORT, _rejected
@@ -129,6 +130,10 @@ def _report_row(data: bytes) -> object:
 
 def _import_report(data: bytes) -> object:
     return _rejected(in_file(f"import/{IMPORT_REPORT}", data).parent)
+
+
+def _oracle_episodes(data: bytes) -> object:
+    return read_episodes(in_file("run/oracle_episodes.json", data))
 
 
 def _outcome(data: bytes) -> object:
@@ -264,6 +269,13 @@ def table() -> dict[str, Decoder]:
             (TrainerError,),
             lambda: (b'{"outcomes": [{"name": "a", "reason": ""}, {"name": "b", "reason": "no_scene"}]}',),
             frozenset({"trainer.evaluation.benchmark:_rejected"}),
+            mutate_json,
+        ),
+        "episodes of the oracle": Decoder(
+            _oracle_episodes,
+            (TrainerError,),
+            lambda: (b'{"task": ["room kitchen_0", ["open fridge", "did"], ["done", "robot kitchen_0"]]}',),
+            frozenset({"trainer.episodes.oracle:read_episodes"}),
             mutate_json,
         ),
         "outcome of a run": Decoder(

@@ -220,6 +220,19 @@ COMMANDS = (
     CommandCase(
         "scene and --all", "scene build Rs_int --all --out=FILES/new", "Rs_int", "give names or --all"
     ),
+    CommandCase(
+        "policy of plans in episodes",
+        "train --model=core/embomatrix/starter/policy/policy --episodes=seen --dataset=KITCHEN --out=FILES/new",
+        "core/embomatrix/starter/policy",
+        "leave out episodes.visibility",
+    ),
+    CommandCase(
+        "language model in episodes",
+        "train --model=some/model --episodes=seen --dataset=KITCHEN --out=FILES/new",
+        "episodes.visibility",
+        "pass --model tiny",
+    ),
+    CommandCase("unknown visibility", "train --episodes=half --dataset=KITCHEN", "half", "full"),
     CommandCase("negative minutes", "train --minutes=-1", "--minutes", "greater than or equal to 0"),
     CommandCase("option without number", "train --steps=many", "--steps", "valid integer"),
     CommandCase(

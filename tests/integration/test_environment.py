@@ -1,6 +1,7 @@
 """The front door to episodes: the same answers have the same observations in this process and on a cluster."""
 
 import asyncio
+from pathlib import Path
 
 import pytest
 from tests.fakes.real_cluster import RealCluster, connected
@@ -121,4 +122,12 @@ def test_misuse_is_named(dataset):
 
 
 def test_format_of_the_texts_is_the_documented_one():
-    assert FORMAT == 1
+    page = (Path(__file__).parents[2] / "docs" / "episodes.md").read_text()
+    assert f"at present format {FORMAT} " in page
+
+
+def test_a_word_level_policy_is_told_the_rooms_that_it_may_go_to(dataset):
+    with make(dataset, visibility="seen", codec="names") as environment:
+        rooms = environment.reset().user.splitlines()[0].split()
+        assert rooms[0] == "rooms"
+        assert all(environment.step(f"go_to_room {room}").steps[0].ok for room in rooms[1:])

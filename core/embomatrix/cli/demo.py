@@ -13,9 +13,10 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cluster, run_command
+from embomatrix.envs.rules import Visibility
 from embomatrix.host.failure import fail
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
-from embomatrix.starter.shipped import demo_settings, unpack
+from embomatrix.starter.shipped import NAMED, demo_settings, unpack
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 
 DEFAULT_OUT: Final = Path("runs/demo")
@@ -35,7 +36,7 @@ def demo(
     dataset: Annotated[
         Path,
         typer.Option(
-            help="Folder of the dataset. If it is missing, the shipped tasks are unpacked there.",
+            help="Folder of the dataset, or `search`. If it is missing, the shipped tasks are unpacked there.",
             envvar=DATASET_VARIABLE,
         ),
     ] = DEFAULT_DATASET,
@@ -45,6 +46,12 @@ def demo(
     imitate_steps: Annotated[
         int, typer.Option(min=0, help="Steps of imitation before GRPO.")
     ] = IMITATION_STEPS,
+    episodes: Annotated[
+        Visibility | None,
+        typer.Option(
+            help="Train call by call, told of all objects or of those seen. Takes longer than plans."
+        ),
+    ] = None,
     model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
     seed: Annotated[int, typer.Option(help="Random seed of policy and sampling.")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")] = 0,
@@ -55,12 +62,15 @@ def demo(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     folder = _folder(out)
     started_s = time.monotonic()
-    _ensure_tasks(dataset)
+    is_named = str(dataset) in NAMED and not dataset.exists()
+    if not is_named:
+        _ensure_tasks(dataset)
     built_s = time.monotonic()
-    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=dataset)
+    shown = None if is_named else dataset
+    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=shown)
     with cluster.supervisor:
         _announce(cluster, slots)
-        minutes = _minutes(dataset, model, imitate_steps, steps)
+        minutes = None if is_named or episodes else _minutes(dataset, model, imitate_steps, steps)
         options = [
             f"--model={model}",
             f"--steps={steps}",
@@ -76,6 +86,8 @@ def demo(
                 highlight=False,
             )
             options.append(f"--warn-after={max(0.0, minutes - (time.monotonic() - started_s) / 60)}")
+        if episodes is not None:
+            options.append(f"--episodes={episodes.value}")
         if threads:
             options.append(f"--threads={threads}")
         where = [f"--dataset={dataset}", f"--manager={cluster.address}", f"--out={folder}"]
@@ -87,7 +99,10 @@ def demo(
         highlight=False,
     )
     task_id = _most_successful_task(folder)
-    if task_id:
+    if episodes is not None:
+        bench = f"--bench {dataset} --visibility {episodes.value}"
+        typer.echo(f"try next: embomatrix eval --model {folder} --interactive --samples 1 {bench}")
+    elif task_id:
         # Rich would wrap a line that is meant to be copied.
         typer.echo(f"try next: embomatrix play {task_id} --policy {folder} --dataset {dataset}")
 

@@ -66,6 +66,7 @@ class Subject:
 def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
     """Load the model. Raises TrainerError."""
     from embomatrix.trainer.evaluation.models import load_model
+    from embomatrix.trainer.policy.tiny import TinyPolicy
 
     policy, trained = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
     if isinstance(exam, NativeExam) and policy.codec is Codec.NAMES:
@@ -77,6 +78,14 @@ def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
     max_tokens = settings.max_tokens or room_for(trained.grpo.max_new, prompts, ruler)
     check_context(prompts, max_tokens, ruler, MAX_TOKENS)
     rows = trained.prompt.rows
+    if isinstance(policy, TinyPolicy) and policy.single_calls:
+        if not isinstance(exam, EpisodeExam):
+            raise TrainerError(f"{model} was trained in episodes and writes no plans: pass --interactive")
+        from embomatrix.trainer.evaluation.conversing import converse_in_episodes
+
+        return Subject(
+            functools.partial(converse_in_episodes, policy, exam.stage), policy.codec, rows, max_tokens, ruler
+        )
     if isinstance(exam, EpisodeExam):
         from embomatrix.trainer.evaluation.replanning import ask_policy_in_episodes
 

@@ -220,6 +220,7 @@ def _plan_of_policy(named: str, situation: Situation, seed: int) -> Plan:
     from embomatrix.trainer.config.errors import TrainerError
     from embomatrix.trainer.evaluation.models import load_model
     from embomatrix.trainer.policy.limits import Ruler, room_for
+    from embomatrix.trainer.policy.tiny import TinyPolicy
 
     try:
         policy, settings = load_model(named, None, threads=None, device="cpu")
@@ -228,6 +229,10 @@ def _plan_of_policy(named: str, situation: Situation, seed: int) -> Plan:
         max_new = room_for(settings.grpo.max_new, {situation.instruction: prompt}, Ruler.of_policy(policy))
     except TrainerError as error:
         fail(str(error))
+    if isinstance(policy, TinyPolicy) and policy.single_calls:
+        fail(
+            f"{named} plays episodes and writes no plans: run `embomatrix eval --interactive --model {named}`"
+        )
     drawn = policy.sample([policy.encode(prompt)], 1, 0.0, max_new, torch.Generator().manual_seed(seed))
     return parse_policy_text(drawn.texts[0], asked, policy.codec)
 

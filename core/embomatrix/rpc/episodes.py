@@ -44,7 +44,14 @@ _OF_ONE_TURN: Final = (InvalidRequestError, PreconditionError, InternalError)
 
 
 class TurnFailedError(ClusterError):
-    """Turn without a result: every attempt failed, or its run was closed. The episode may act again."""
+    """Turn without a result: every attempt failed, or its run was closed. The episode may act again.
+
+    ``failure`` is what the manager says about the last attempt, if it does.
+    """
+
+    def __init__(self, message: str, failure: InfraFailure | None = None) -> None:
+        super().__init__(message)
+        self.failure = failure
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +215,6 @@ def _turn_of(outcome: Outcome) -> Turn:
         case InfraFailure(InfraCode.PREFIX_MISMATCH, message):
             raise PrefixMismatchError(message)
         case InfraFailure(code, message):
-            raise TurnFailedError(f"the turn has no result ({code}): {message}")
+            raise TurnFailedError(f"the turn has no result ({code}): {message}", InfraFailure(code, message))
         case Cancelled(reason):
             raise TurnFailedError(f"the turn was cancelled: {reason}; is its run still open?")

@@ -1,4 +1,4 @@
-"""Texts of episodes, format 1: the prompt at the start, and the observation after each answer.
+"""Texts of episodes, format 2: the prompt at the start, and the observation after each answer.
 
 Three codecs, as for prompts: ``names`` for word-level policies, ``lines`` and ``json`` for language models. Objects have the
 names that the prompt gives them; an object that the policy does not know is ``something``.
@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.describe import words_of
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import DONE, PlanError, PlanReason
 from embomatrix.skills.prompt import (
     ABSENT,
@@ -37,10 +38,15 @@ if TYPE_CHECKING:
     from embomatrix.skills.trace import Step
     from embomatrix.world.task import Profile
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 """Version of the texts. It changes when any of them does."""
 UNKNOWN: Final = "something"
 """Name of an object that the policy does not know."""
+DID: Final = "did"
+FAILED: Final = "failed"
+UNPARSABLE: Final = "unparsable"
+OBSERVATION_WORDS: Final = (DID, FAILED, UNPARSABLE, UNKNOWN, "holds", "rooms", *FailureReason)
+"""Words of observations in the codec ``names``, besides those of prompts."""
 _NAME: Final = re.compile(r"\b[a-z][a-z0-9_]*_\d+\b")
 _FIRST: Final = ("open", "closed", "on", "off")
 """States that a prompt names before the others."""
@@ -70,7 +76,7 @@ def opening(situation: Situation, codec: Codec, *, seen: bool, at_once: int) -> 
     """
     prompt = prompt_for(situation, codec)
     if codec is Codec.NAMES:
-        return prompt
+        return Prompt("", f"rooms {' '.join(situation.home)}\n{prompt.user}") if seen else prompt
     rooms = f"Rooms: {', '.join(situation.home)}\n" if seen else ""
     return Prompt(_system(codec, situation.profile, seen=seen, at_once=at_once), rooms + prompt.user)
 
@@ -213,13 +219,13 @@ def _in_names(
     notes: Sequence[str],
 ) -> str:
     """Short text of words: ``failed blocked fridge``, then rows, then the robot."""
-    lines = ["failed unparsable"] if notes and not steps else []
+    lines = [f"{FAILED} {UNPARSABLE}"] if notes and not steps else []
     for step in steps:
         if step.failure is None:
-            lines.append("did")
+            lines.append(DID)
         else:
             blocker = [wording.name(step.blocker)] if step.blocker else []
-            lines.append(" ".join(["failed", step.failure.value, *blocker]))
+            lines.append(" ".join([FAILED, step.failure.value, *blocker]))
     lines += map(wording.row, (*new, *changed))
     hand = ["holds", *(wording.name(row.name) for row in held_rows(situation))] if situation.held else []
     lines.append(" ".join(["robot", situation.robot_room, *hand]))

@@ -36,6 +36,8 @@ SEARCH: Final = "search"
 """Name of the dataset of those tasks of the corpus whose things must be searched for."""
 FROZEN: Final = (VERIFIED, SEARCH)
 """Names of the lists of tasks that are frozen by id."""
+NAMED: Final = (STARTER, *FROZEN)
+"""Names of all datasets that ship."""
 FROZEN_MARK: Final = b'"digest": "sha256:'
 """Mark of a file of frozen tasks."""
 _POLICY: Final = "policy"

@@ -100,6 +100,21 @@ async def test_recently_used_bundles_are_not_deleted(full):
     assert full.there() == "cde"
 
 
+async def test_another_upload_may_end_while_room_is_made(full, monkeypatch):
+    scan = os.scandir
+
+    def during_another_upload(folder):
+        incoming = full.path / "incoming-other"
+        incoming.write_bytes(b"half")
+        entries = list(scan(folder))
+        incoming.rename(full.path / "other.bundle")
+        return iter(entries)
+
+    monkeypatch.setattr("embomatrix.manager.runtime.bundles.os.scandir", during_another_upload)
+    await full.put("d")
+    assert full.there() == "bcd"
+
+
 async def test_incomplete_files_are_deleted_at_start(tmp_path):
     old, young = tmp_path / "incoming-old", tmp_path / "incoming-young"
     for path, at_s in ((old, 1_000_000.0 - 3600), (young, 1_000_000.0 - 1)):

@@ -20,6 +20,7 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, Overlong
 from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.batch import minibatches_of
+from embomatrix.trainer.grpo.sampling import Sampler
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.learning.learner import Learner
@@ -81,7 +82,8 @@ class Trial:
         self.learner = RecordingLearner(self.policy, reference, self.settings, fails_at=fails_at)
         builder = PromptBuilder(self.policy, 16, Variation(TASKS.kinds, 0.0, 0.0))
         workers = DataParallelWorkers(self.learner)
-        self.updater = Updater(self.policy, workers, builder, TaskRewards(), self.settings, Stopwatch())
+        sampler = Sampler(workers, self.policy.codec, builder, TaskRewards(), self.settings)
+        self.updater = Updater(self.policy, workers, sampler, self.settings, Stopwatch())
         self.plan = StepPlan(
             step=1,
             tasks=TASKS.train,

@@ -11,6 +11,7 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.trainer.cluster.gateway import PlanOutcome
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, GrpoSettings, OnLost, read_settings
 from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.grpo.sampling import Sampler
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.learning.learner import Learner
@@ -58,7 +59,8 @@ def step(*rewards, **changes):
     reference = TinyPolicy(WORDS, SHAPE, seed=1).frozen_copy()
     workers = DataParallelWorkers(Learner(policy, reference, settings))
     builder = PromptBuilder(policy, 16, Variation(TASKS.kinds, 0.0, 0.0))
-    updater = Updater(policy, workers, builder, RewardingGateway(*rewards), settings, Stopwatch())
+    sampler = Sampler(workers, policy.codec, builder, RewardingGateway(*rewards), settings)
+    updater = Updater(policy, workers, sampler, settings, Stopwatch())
     before = weights(policy)
     record, _ = updater.take_step(
         StepPlan(

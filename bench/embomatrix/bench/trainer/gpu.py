@@ -25,6 +25,7 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, GrpoSettings, read_settings
 from embomatrix.trainer.data.tasks import TrainingTask, load_tasks
 from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.grpo.sampling import Sampler
 from embomatrix.trainer.grpo.update import Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.learning.learner import Learner
@@ -140,7 +141,8 @@ def _take_steps(
     """Take the steps of a load, and return the wall seconds of the measured ones."""
     builder = PromptBuilder(learner.policy, ROWS, Variation({}, rename=0.0, drop=0.0))
     workers = DataParallelWorkers(learner)
-    updater = Updater(learner.policy, workers, builder, LengthScore(), settings, Stopwatch())
+    sampler = Sampler(workers, learner.policy.codec, builder, LengthScore(), settings)
+    updater = Updater(learner.policy, workers, sampler, settings, Stopwatch())
     generator = torch.Generator().manual_seed(load.seed)
     spent_s = []
     for step in range(load.unmeasured + load.steps):

@@ -11,6 +11,7 @@ from embomatrix.bench.trainer.steps import ROWS, LengthScore, Load, policy_of, s
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, TrainSettings, read_settings
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.grpo.sampling import Sampler
 from embomatrix.trainer.grpo.update import Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.learning.learner import Learner, SamplingRule
@@ -54,9 +55,9 @@ def plan_error(
     reference = policy.frozen_copy()
     learner = LongPlanLearner(policy, reference, settings.grpo)
     builder = PromptBuilder(policy, settings.prompt.rows, Variation({}, rename=0.0, drop=0.0))
-    updater = Updater(
-        policy, DataParallelWorkers(learner), builder, LengthScore(), settings.grpo, Stopwatch()
-    )
+    workers = DataParallelWorkers(learner)
+    sampler = Sampler(workers, policy.codec, builder, LengthScore(), settings.grpo)
+    updater = Updater(policy, workers, sampler, settings.grpo, Stopwatch())
     generator = torch.Generator().manual_seed(settings.seed)
     chosen = [tasks[at % len(tasks)] for at in range(settings.grpo.tasks_per_step)]
 

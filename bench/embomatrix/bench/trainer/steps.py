@@ -26,6 +26,7 @@ from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome
 from embomatrix.trainer.config.settings import GrpoSettings
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.grpo.sampling import Sampler
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.learning.learner import Learner
@@ -101,7 +102,8 @@ def own_step_s(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
     )
     prompt_builder = PromptBuilder(policy, ROWS, Variation({}, rename=0.0, drop=0.0))
     workers = DataParallelWorkers(Learner(policy, policy, settings))
-    updater = Updater(policy, workers, prompt_builder, LengthScore(), settings, Stopwatch())
+    sampler = Sampler(workers, policy.codec, prompt_builder, LengthScore(), settings)
+    updater = Updater(policy, workers, sampler, settings, Stopwatch())
     generator = torch.Generator().manual_seed(load.seed)
     spent_s = []
     for step in range(load.unmeasured + load.steps):

@@ -165,7 +165,11 @@ class BundleStore:
 
     def _make_room(self, size: int, needed: AbstractSet[str]) -> None:
         """Delete bundles until the folder, with the incoming bundle of ``size`` bytes, is within its bound."""
-        files = {entry.name: entry.stat() for entry in os.scandir(self._folder) if entry.is_file()}
+        files: dict[str, os.stat_result] = {}
+        for entry in os.scandir(self._folder):
+            with contextlib.suppress(FileNotFoundError):  # another bundle got its name meanwhile
+                if entry.is_file():
+                    files[entry.name] = entry.stat()
         used = sum(found.st_size for found in files.values())
         kept = {self._path(digest).name for digest in needed}
         before_s = self._clock() - self._keep_s

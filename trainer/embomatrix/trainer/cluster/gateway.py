@@ -19,7 +19,9 @@ from typing import Any, Final, Protocol, Self, TypeVar
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.reward.settings import RewardSettings
+from embomatrix.reward.turns import RunningEpisode
 from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.episodes import Episodes
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import ClusterError, DeadlineError, PreconditionError, UnavailableError
 from embomatrix.rpc.wire.training import TrainingReport
@@ -61,22 +63,27 @@ class PlanOutcome:
 
     ``reward`` is None if the infrastructure lost the rollout, which says nothing about the plan. ``outcome`` is None for text
     that can't be parsed: it is scored here and never executed, and ``problem`` gives the reason.
+
+    The text of an episode has its answers, and there is no ``outcome``: ``played`` has its steps, failed ones included, and
+    ``cost`` what they cost.
     """
 
     text: str
     reward: RewardBreakdown | None
     outcome: Outcome | None = None
     problem: str = ""
+    cost: float = 0.0
+    played: tuple[Step, ...] = ()
 
     @property
     def value(self) -> float:
         """Total reward, NaN if there is none."""
-        return math.nan if self.reward is None else self.reward.total
+        return math.nan if self.reward is None else self.reward.total - self.cost
 
     @property
     def steps(self) -> tuple[Step, ...]:
         """Executed steps; none for a lost or unparsable plan."""
-        return self.outcome.steps if isinstance(self.outcome, Completed) else ()
+        return self.outcome.steps if isinstance(self.outcome, Completed) else self.played
 
     @property
     def lost(self) -> str:
@@ -91,7 +98,9 @@ class PlanOutcome:
     def weighted_reward(self, relevance: float) -> float:
         """Reward with a weight on its relevance tier, NaN if there is none."""
         reward = self.reward
-        return math.nan if reward is None else reward.format + relevance * reward.relevance + reward.goal
+        if reward is None:
+            return math.nan
+        return reward.format + relevance * reward.relevance + reward.goal - self.cost
 
     @property
     def success(self) -> bool:
@@ -217,6 +226,7 @@ class Gateway:
         async with contextlib.AsyncExitStack() as stack:
             self._cluster = await stack.enter_async_context(self._open_cluster())
             self.run_id = await self._cluster.open_run(self._run_name, terms=self._terms)
+            self._episodes = await stack.enter_async_context(Episodes(self._cluster, self.run_id))
             self._connection = stack.pop_all()
 
     def __exit__(self, *_: object) -> None:
@@ -249,7 +259,21 @@ class Gateway:
         self._loop.close()
 
     def _run_on_loop(self, work: Coroutine[Any, Any, T]) -> T:
-        return result_of(asyncio.run_coroutine_threadsafe(work, self._loop))
+        return result_of(self.run(work))
+
+    def run(self, work: Coroutine[Any, Any, T]) -> Future[T]:
+        """Start work on the gateway's thread, such as turns of episodes."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    @property
+    def reward(self) -> RewardSettings:
+        """Coefficients of the run's reward."""
+        return self._terms.reward
+
+    async def begin_episode(self, task: TrainingTask, seed: int, *, sight: bool) -> RunningEpisode:
+        """Begin an episode, on the gateway's thread. Raises ClusterError if the task's bundle can't be uploaded."""
+        await self._upload_once(task.bundle_digest)
+        return self._episodes.begin(task.bundle_digest, task.task.task_id, seed, sight=sight)
 
     def announce(self, steps: Mapping[int, Sequence[TrainingTask]], group: int) -> None:
         """Replace the look-ahead: the tasks of the coming steps. A rejection is only logged, because look-ahead is advice."""

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.envs.rules import Visibility
 from embomatrix.host.failure import INTERRUPTED, fail, unwritable
 from embomatrix.host.own_files import prepare_output
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
@@ -94,6 +95,12 @@ def train(
     resume: _RESUME = False,
     seed: _SEED = None,
     settings_file: _SETTINGS = None,
+    episodes: Annotated[
+        Visibility | None,
+        typer.Option(
+            help="Train call by call instead of on whole plans. The policy is told of all objects, or of those it has seen.",
+        ),
+    ] = None,
     reward: _REWARD = None,
     threads: _THREADS = None,
     processes: _PROCESSES = None,
@@ -148,6 +155,7 @@ def train(
             "grpo.steps": steps,
             "imitation.seconds": imitate_seconds,
             "imitation.steps": imitate_steps,
+            "episodes.visibility": episodes,
             "evaluation.every": evaluate_every,
             "evaluation.tasks": evaluate_tasks,
             "track": track,

@@ -17,6 +17,7 @@ from pydantic import (
     model_validator,
 )
 
+from embomatrix.envs.rules import Visibility
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.config.errors import TrainerError
@@ -122,6 +123,20 @@ class TinySettings(_Frozen):
     width: int = Field(default=128, ge=16)
     heads: int = Field(default=4, ge=1)
     inner: int = Field(default=384, ge=16)
+
+
+class EpisodesTable(_Frozen):
+    """Episodes instead of whole plans: the policy answers call by call, and is told what happened."""
+
+    visibility: Visibility | None = None
+    """``full``: the policy is told of all objects; ``seen``: of those that the robot has seen. None: it writes whole plans."""
+    calls_factor: float = Field(default=2.0, ge=1)
+    """Budget of calls: this many times those of the oracle plan, and ``calls_more``."""
+    calls_more: int = Field(default=12, ge=0)
+    call_cost: float = Field(default=0.0, ge=0)
+    """Subtracted from an episode's reward for each call."""
+    failure_cost: float = Field(default=0.0, ge=0)
+    """Subtracted from an episode's reward for each failed call, besides ``call_cost``."""
 
 
 class LoraSettings(_Frozen):
@@ -370,6 +385,7 @@ class TrainSettings(_Frozen):
     lora: LoraSettings = LoraSettings()
     sampler: SamplerSettings = SamplerSettings()
     prompt: PromptSettings = PromptSettings()
+    episodes: EpisodesTable = EpisodesTable()
     imitation: ImitationSettings = ImitationSettings()
     grpo: GrpoSettings = GrpoSettings()
     reward: RewardTable = RewardTable()

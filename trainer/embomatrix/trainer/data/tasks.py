@@ -10,6 +10,7 @@ import numpy as np
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.skills.prompt import Situation, situation_of
 from embomatrix.skills.syntax import Plan
+from embomatrix.starter.shipped import NAMED, dataset_named
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.asset import Asset
 from embomatrix.world.bundle import Bundle
@@ -43,11 +44,11 @@ class TaskSet:
 
 
 def load_tasks(folder: Path) -> TaskSet:
-    """Load a dataset folder. Raises TrainerError if it is missing or damaged."""
+    """Load a dataset folder, or a shipped one by its name. Raises TrainerError if it is missing or damaged."""
     kinds = KindTable()
     try:
-        dataset = Dataset.load(folder)
-    except DatasetError as error:
+        dataset = dataset_named(str(folder) if str(folder) in NAMED else folder)
+    except (DatasetError, OSError) as error:
         raise TrainerError(str(error)) from error
     tasks = read_tasks(dataset, kinds.add)
     train = tuple(tasks[record.task.task_id] for record in dataset.train)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from embomatrix.envs.player import EpisodePlayer
-from embomatrix.envs.rules import EpisodeRules, Visibility
+from embomatrix.envs.rules import Visibility
 from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.ledger import Ledger
 from embomatrix.llm.values import ChatModel, ChatRequest, LlmError, Message, Reply, Speaker
@@ -25,9 +25,9 @@ from embomatrix.scripts.searching import PlacePriors, SearchingScript
 from embomatrix.skills.parse import DONE, plan_to_lines
 from embomatrix.skills.prompt import Codec, Prompt, prompt_for
 from embomatrix.skills.seeds import evaluation_seed
-from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.episodes.terms import EpisodeTerms
 from embomatrix.trainer.evaluation.answer_sources import PURPOSE, OnProgress, seed_of
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup
 from embomatrix.trainer.evaluation.benchmark import Benchmark
@@ -47,25 +47,6 @@ if TYPE_CHECKING:
 
 TURNS_FILE: Final = "turns.jsonl"
 """Answers of a model within episodes, as they arrive."""
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeTerms:
-    """Terms of all episodes of an evaluation. The budget of calls is a multiple of the oracle's, and some more."""
-
-    visibility: Visibility
-    calls_factor: float
-    calls_more: int
-
-    def rules(self, oracle: Plan) -> EpisodeRules:
-        """Rules of an episode of a task with this oracle plan; without one, the budget is 64 calls."""
-        most = int(self.calls_factor * len(oracle)) + self.calls_more if oracle else MAX_STEPS
-        return EpisodeRules(self.visibility, calls=max(1, min(MAX_STEPS, most)))
-
-    @staticmethod
-    def of(setup: EvaluationSetup) -> EpisodeTerms:
-        """Terms of a setup of episodes."""
-        return EpisodeTerms(Visibility(setup.visibility), setup.calls_factor, setup.calls_more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +130,15 @@ class EpisodeStage:
     async def _play(
         self, simulation: Simulation, setup: EvaluationSetup, task_id: str, sample: int, play: Play
     ) -> None:
-        terms = EpisodeTerms.of(setup)
+        terms = _terms_of(setup)
         record, task = self._records[task_id], self._bench.tasks[task_id]
-        running = await simulation.begin(
-            record, evaluation_seed(setup.seed, task_id), sight=terms.visibility is Visibility.SEEN
-        )
+        running = await simulation.begin(record, evaluation_seed(setup.seed, task_id), sight=terms.sight)
         player = EpisodePlayer(running, task.situation, terms.rules(task.oracle), Codec(setup.codec))
         await play(task_id, sample, await player.begin(), player)
+
+
+def _terms_of(setup: EvaluationSetup) -> EpisodeTerms:
+    return EpisodeTerms(Visibility(setup.visibility), setup.calls_factor, setup.calls_more)
 
 
 def _first(errors: ExceptionGroup[Exception]) -> Exception:

@@ -191,7 +191,7 @@ class _Collected:
     def _take(self, group: PlanGroup, future: Future[tuple[PlanOutcome, ...]]) -> None:
         outcomes = result_of(future)
         self.outcomes += outcomes
-        self.scores.append(_task_score(group.task, outcomes))
+        self.scores.append(task_score(group.task, outcomes))
         self.answers += [_answer(group, self.codec, sample, each) for sample, each in enumerate(outcomes)]
         self.report(len(self.scores))
 
@@ -211,7 +211,8 @@ def _answer(group: PlanGroup, codec: Codec, sample: int, outcome: PlanOutcome) -
     return HeldOutAnswer(outcome.text, verdict, plan)
 
 
-def _task_score(task: TrainingTask, outcomes: Sequence[PlanOutcome]) -> TaskScore:
+def task_score(task: TrainingTask, outcomes: Sequence[PlanOutcome]) -> TaskScore:
+    """Score of a task from the outcomes of its samples."""
     known = [outcome for outcome in outcomes if outcome.reward is not None]
     return TaskScore(
         task_id=task.task.task_id,

@@ -16,7 +16,7 @@ from embomatrix.trainer.config.settings import GrpoSettings, LossKind, OnLost
 from embomatrix.trainer.grpo.records import GroupLog
 from embomatrix.trainer.learning.learner import Microbatch
 from embomatrix.trainer.learning.objective import LossTotals, group_advantages
-from embomatrix.trainer.policy.protocol import Tokens
+from embomatrix.trainer.policy.protocol import Tokens, written_lengths
 
 if TYPE_CHECKING:
     from embomatrix.trainer.cluster.gateway import PlanOutcome
@@ -30,8 +30,8 @@ class ScoredGroup:
     """Plans of one task as rows, with their advantages. Tensors have shape (G, tokens), ``advantages`` has (G,).
 
     ``mask`` is true on tokens in the loss: not on those of lost plans, nor of plans that ``Overlong.MASK`` leaves out.
-    ``longest`` counts the tokens of the longest plan, ``counted`` the group's tokens in the denominator of the loss.
-    ``learns`` is false for groups without a gradient.
+    ``longest`` counts the tokens up to the end of the longest plan, ``counted`` those of the group in the denominator of the
+    loss. ``learns`` is false for groups without a gradient.
     """
 
     log: GroupLog
@@ -75,7 +75,7 @@ def scored_groups(
         for column in (
             advantages.zero_variance,
             samples.cut_off.view(shape).sum(dim=1),
-            samples.mask.sum(dim=1).view(shape).amax(dim=1),
+            written_lengths(samples.mask).view(shape).amax(dim=1),
             chunk.mask.sum(dim=1).view(shape).sum(dim=1),
         )
     )

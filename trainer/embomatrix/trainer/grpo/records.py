@@ -49,9 +49,9 @@ class StepRecord:
     lost: int
     cut_off: float
     """Share of the rollouts that ``grpo.max_new`` cut off before their end token."""
-    warm: float
-    shared: float
-    """Share of the steps that were known from equal plans or equal beginnings and not executed."""
+    warm: float | None
+    shared: float | None
+    """Share of the steps that were known from equal plans or equal beginnings and not executed. Both are None in episodes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ def record_of(
         success=_mean([outcome.success for outcome in known]),
         success_by_category=_by_category(logs),
         well_formed=_mean([not outcome.problem for outcome in known]),
-        plan_steps=_mean([len(outcome.steps) for outcome in executed]),
+        plan_steps=_mean([len(outcome.steps) for outcome in known if not outcome.problem]),
         zero_variance_groups=_mean([log.zero_variance for log in logs]),
         groups=len(logs),
         entropy=over_tokens("entropy"),
@@ -107,8 +107,8 @@ def record_of(
         rollouts=len(outcomes),
         lost=len(outcomes) - len(known),
         cut_off=sum(log.cut_off for log in logs) / max(1, len(outcomes)),
-        warm=_mean([outcome.warm for outcome in executed]),
-        shared=sum(outcome.shared_steps for outcome in executed) / max(1, steps),
+        warm=_mean([outcome.warm for outcome in executed]) if executed else None,
+        shared=sum(outcome.shared_steps for outcome in executed) / max(1, steps) if executed else None,
     )
 
 

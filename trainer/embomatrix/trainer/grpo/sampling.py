@@ -16,14 +16,19 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome, PlanSubmitter, result_of
 from embomatrix.trainer.config.settings import GrpoSettings, Overlong
 from embomatrix.trainer.data.tasks import TrainingTask
+from embomatrix.trainer.episodes.games import Game, PlayedGame, play_games
+from embomatrix.trainer.episodes.players import EpisodePlayers, EpisodeStart
 from embomatrix.trainer.learning.learner import SamplingRule
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
 from embomatrix.trainer.serving.sampler import Draw, ServerSampler, begin_drawing
 
 if TYPE_CHECKING:
+    from embomatrix.trainer.cluster.gateway import Gateway
+    from embomatrix.trainer.episodes.terms import EpisodeTerms
     from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
     from embomatrix.trainer.learning.learner import Learner
+    from embomatrix.trainer.policy.protocol import Policy
 
 _SEEDS: Final = 2**62
 
@@ -45,6 +50,8 @@ class SampledChunk:
     futures: Sequence[Future[tuple[PlanOutcome, ...]]]
     reference: Tensor | None = None
     old_logprobs: Tensor | None = None
+    waited_s: float = 0.0
+    """Seconds of sampling in which the trainer's own process waited for the cluster: in episodes."""
 
     @property
     def plans(self) -> int:
@@ -63,6 +70,15 @@ class SampledChunk:
     def outcomes(self) -> list[tuple[PlanOutcome, ...]]:
         """Wait for the outcomes of every task. Raises TrainerError if the cluster failed."""
         return [result_of(future) for future in self.futures]
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Tasks of a step that are sampled together, with the seed of their samples. ``index`` counts the parts from 0."""
+
+    index: int
+    tasks: Sequence[TrainingTask]
+    seed: int
 
 
 class Sampler:
@@ -84,6 +100,11 @@ class Sampler:
         self._gateway = gateway
         self._settings = settings
 
+    @property
+    def is_served(self) -> bool:
+        """True if a model server samples, whose log-probabilities differ from the policy's."""
+        return self._server is not None
+
     def sample(
         self,
         step: int,
@@ -99,21 +120,32 @@ class Sampler:
         A chunk's samples depend only on its index and ``generator``, not on the process that draws them. A model server
         samples all chunks at once. ``seed_of`` returns the seed of a task's rollouts in a step.
         """
-        settings = self._settings
-        size, rule = settings.chunk, SamplingRule.of(settings)
-        jobs = []
+        size = self._settings.chunk
+        parts = []
         for index, at in enumerate(range(0, len(tasks), size), start=first_index):
-            prompts = [(task, self._prompt_builder.varied(task, rng)) for task in tasks[at : at + size]]
             seed = int(torch.randint(_SEEDS, (), generator=generator, device=generator.device))
-            draw = begin_drawing(self._server, [prompt.tokens for _, prompt in prompts], seed, rule)
-            jobs.append((index, functools.partial(self._chunk, step, index, prompts, draw, seed_of)))
-        chunks = self._workers.map(jobs)
+            parts.append(_Part(index, tasks[at : at + size], seed))
+        chunks = self._chunks(step, parts, rng, functools.partial(seed_of, step))
         if not self._settings.kl_coef:
             return chunks
         # The reference pass needs no rewards: it runs last, while the cluster works.
         return self._workers.map(
             [(chunk.index, functools.partial(_with_reference, chunk)) for chunk in chunks]
         )
+
+    def _chunks(
+        self, step: int, parts: Sequence[_Part], rng: np.random.Generator, seed_of: Callable[[str], int]
+    ) -> list[SampledChunk]:
+        """Sample the parts of a step and submit their plans. ``seed_of`` returns the seed of a task's rollouts."""
+        rule = SamplingRule.of(self._settings)
+        jobs = []
+        for part in parts:
+            prompts = [(task, self._prompt_builder.varied(task, rng)) for task in part.tasks]
+            draw = begin_drawing(self._server, [prompt.tokens for _, prompt in prompts], part.seed, rule)
+            jobs.append(
+                (part.index, functools.partial(self._chunk, step, part.index, prompts, draw, seed_of))
+            )
+        return self._workers.map(jobs)
 
     def with_old_logprobs(self, chunks: Sequence[SampledChunk]) -> list[SampledChunk]:
         """Return chunks that older weights sampled with their log-probabilities under the current ones."""
@@ -127,7 +159,7 @@ class Sampler:
         index: int,
         prompts: Sequence[tuple[TrainingTask, TaskPrompt]],
         draw: Draw,
-        seed_of: Callable[[int, str], int],
+        seed_of: Callable[[str], int],
         learner: Learner | RemoteLearner,
     ) -> SampledChunk:
         group = self._settings.group
@@ -137,7 +169,7 @@ class Sampler:
                 task,
                 prompt.situation,
                 samples.texts[row * group : (row + 1) * group],
-                seed_of(step, task.task.task_id),
+                seed_of(task.task.task_id),
             )
             for row, (task, prompt) in enumerate(prompts)
         ]
@@ -147,6 +179,64 @@ class Sampler:
         if self._settings.overlong is Overlong.MASK:
             mask = mask & ~samples.cut_off[:, None]
         return SampledChunk(index, tasks, task_prompts, samples, mask, futures)
+
+
+class EpisodeSampler(Sampler):
+    """Plays episodes on all data-parallel workers. The chunks have their outcomes when ``sample`` returns."""
+
+    def __init__(
+        self,
+        workers: DataParallelWorkers,
+        policy: Policy,
+        prompt_builder: PromptBuilder,
+        gateway: Gateway,
+        settings: GrpoSettings,
+        terms: EpisodeTerms,
+    ) -> None:
+        super().__init__(workers, policy.codec, prompt_builder, gateway, settings)
+        self._policy = policy
+        self._players = EpisodePlayers(gateway, terms, policy.codec)
+        self._terms = terms
+
+    def _chunks(
+        self, step: int, parts: Sequence[_Part], rng: np.random.Generator, seed_of: Callable[[str], int]
+    ) -> list[SampledChunk]:
+        games = [
+            Game(
+                part.index,
+                [
+                    EpisodeStart(
+                        task,
+                        self._prompt_builder.told(task, seen=self._terms.sight),
+                        seed_of(task.task.task_id),
+                    )
+                    for task in part.tasks
+                ],
+                part.seed,
+            )
+            for part in parts
+        ]
+        rule = SamplingRule.of(self._settings)
+        played = play_games(games, self._workers, self._players, self._policy, rule)
+        return [_chunk_of(each, here=self._workers.remote(each.game.index) is None) for each in played]
+
+
+def _chunk_of(played: PlayedGame, *, here: bool) -> SampledChunk:
+    starts = played.game.starts
+    futures = []
+    for outcomes in played.outcomes():
+        future: Future[tuple[PlanOutcome, ...]] = Future()
+        future.set_result(outcomes)
+        futures.append(future)
+    return SampledChunk(
+        played.game.index,
+        [start.task for start in starts],
+        [TaskPrompt(start.situation, tokens) for start, tokens in zip(starts, played.prompts, strict=True)],
+        played.samples,
+        played.samples.mask,
+        futures,
+        waited_s=played.waited_s if here else 0.0,
+    )
 
 
 def _with_reference(chunk: SampledChunk, learner: Learner | RemoteLearner) -> SampledChunk:

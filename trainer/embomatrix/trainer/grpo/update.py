@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from embomatrix.trainer.cluster.gateway import PlanOutcome, PlanSubmitter, refuse_without_workers
+from embomatrix.trainer.cluster.gateway import PlanOutcome, refuse_without_workers
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, Overlap
 from embomatrix.trainer.data.tasks import TrainingTask
@@ -42,9 +42,7 @@ from embomatrix.trainer.learning.learner import Learner
 from embomatrix.trainer.learning.objective import LossMetrics, LossTotals, loss_divisor
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
-from embomatrix.trainer.policy.prompts import PromptBuilder
 from embomatrix.trainer.policy.protocol import Policy
-from embomatrix.trainer.serving.sampler import ServerSampler
 
 MAX_BAD_GRADIENTS = 5
 """Consecutive updates with a non-finite gradient before the run ends: it has diverged."""
@@ -82,19 +80,16 @@ class Updater:
         self,
         policy: Policy,
         workers: DataParallelWorkers,
-        prompt_builder: PromptBuilder,
-        gateway: PlanSubmitter,
+        sampler: Sampler,
         settings: GrpoSettings,
         stopwatch: Stopwatch,
-        server: ServerSampler | None = None,
     ) -> None:
         self._policy = policy
         self._settings = settings
         self._stopwatch = stopwatch
         self._workers = workers
         self._gradient = GradientSum(policy, workers)
-        self._is_served = server is not None
-        self._sampler = Sampler(workers, policy.codec, prompt_builder, gateway, settings, server)
+        self._sampler = sampler
         self._ahead: tuple[int, list[SampledChunk]] | None = None
         self._bad_gradients = 0
         self.is_between_updates = False
@@ -153,7 +148,7 @@ class Updater:
     ) -> list[SampledChunk]:
         """Sample for this step. Log-probabilities of a model server differ from those of the policy, which are added."""
         chunks = self._sample(plan, plan.step, tasks, first_index)
-        if self._is_served and self._settings.truncate_ratio is not None:
+        if self._sampler.is_served and self._settings.truncate_ratio is not None:
             return self._sampler.with_old_logprobs(chunks)
         return chunks
 
@@ -161,7 +156,9 @@ class Updater:
         self, plan: StepPlan, step: int, tasks: Sequence[TrainingTask], first_index: int = 0
     ) -> list[SampledChunk]:
         rng = plan.rng(step)
-        return self._sampler.sample(step, tasks, rng, plan.generator, plan.seed_of, first_index=first_index)
+        chunks = self._sampler.sample(step, tasks, rng, plan.generator, plan.seed_of, first_index=first_index)
+        self._stopwatch.move(sum(chunk.waited_s for chunk in chunks), Activity.SAMPLING, Activity.WAITING)
+        return chunks
 
     def _totals(self, chunks: Sequence[SampledChunk]) -> LossTotals:
         return LossTotals(

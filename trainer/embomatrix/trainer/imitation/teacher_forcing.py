@@ -24,7 +24,7 @@ from embomatrix.trainer.learning.gradient import GradientSum
 from embomatrix.trainer.learning.likelihood import negative_log_likelihood, plan_tokens
 from embomatrix.trainer.lifecycle.checkpoint import ImitationState
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
-from embomatrix.trainer.policy.prompts import PromptBuilder
+from embomatrix.trainer.policy.prompts import Examples
 from embomatrix.trainer.policy.protocol import Policy
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Imitation:
         self,
         policy: Policy,
         workers: DataParallelWorkers,
-        prompt_builder: PromptBuilder,
+        source: Examples,
         tasks: Sequence[TrainingTask],
         settings: ImitationSettings,
         *,
@@ -64,7 +64,7 @@ class Imitation:
     ) -> None:
         self.state = state or ImitationState()
         self._policy = policy
-        self._prompt_builder = prompt_builder
+        self._source = source
         self._settings = settings
         self._seed = seed
         self._training, self._validation = _split_tasks(tasks, settings, seed)
@@ -131,7 +131,7 @@ class Imitation:
         settings = self._settings
         rng = np.random.default_rng(np.random.SeedSequence((self._seed, 1, self.state.step)))
         chosen = rng.integers(len(self._training), size=settings.batch)
-        examples = [self._prompt_builder.example(self._training[int(at)], rng) for at in chosen]
+        examples = [self._source.example(self._training[int(at)], rng) for at in chosen]
         loss = self._gradient.imitate(examples, settings.chunk or len(examples))
         torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
         interrupts.defer()
@@ -153,7 +153,7 @@ class Imitation:
     def _validation_loss(self) -> float:
         """Mean loss per plan token on the validation tasks."""
         batch = self._settings.batch
-        examples = [self._prompt_builder.plain_example(task) for task in self._validation]
+        examples = [self._source.plain_example(task) for task in self._validation]
         total = sum(
             float(negative_log_likelihood(self._policy, examples[at : at + batch]))
             for at in range(0, len(examples), batch)

@@ -28,11 +28,10 @@ from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingRule
-from embomatrix.trainer.learning.likelihood import Example
 from embomatrix.trainer.learning.objective import LossMetrics
 from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
 from embomatrix.trainer.policy.loading import saved_policy
-from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
+from embomatrix.trainer.policy.protocol import Example, Policy, Samples, Tokens
 
 T = TypeVar("T")
 _ALIGNMENT_BYTES: Final = 64
@@ -93,6 +92,17 @@ class RemoteLearner:
 
     def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
         samples: Samples = self._request("sample", tuple(prompts), seed, rule)
+        return samples
+
+    def converse(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
+        self._request("converse", number, tuple(prompts), seed, rule)
+
+    def reply(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
+        answers: list[str | None] = self._request("reply", number, tuple(rows), tuple(told))
+        return answers
+
+    def end_conversation(self, number: int) -> Samples:
+        samples: Samples = self._request("end_conversation", number)
         return samples
 
     def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
@@ -157,6 +167,9 @@ class _Requests:
         self._settings = settings
         self._learner = Learner(policy, None, settings.grpo)
         self.sample = self._learner.sample
+        self.converse = self._learner.converse
+        self.reply = self._learner.reply
+        self.end_conversation = self._learner.end_conversation
         self.current_logprobs = self._learner.current_logprobs
         self.reference_logprobs = self._learner.reference_logprobs
 

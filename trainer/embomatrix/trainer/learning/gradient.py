@@ -8,9 +8,9 @@ from torch import Tensor
 
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
 from embomatrix.trainer.learning.learner import Learner, Microbatch
-from embomatrix.trainer.learning.likelihood import Example, plan_tokens
+from embomatrix.trainer.learning.likelihood import plan_tokens
 from embomatrix.trainer.learning.objective import LossMetrics
-from embomatrix.trainer.policy.protocol import Policy
+from embomatrix.trainer.policy.protocol import Example, Policy
 
 T = TypeVar("T")
 Gradient = Sequence[Tensor | None]

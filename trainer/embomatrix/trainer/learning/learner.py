@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from embomatrix.trainer.config.settings import GrpoSettings
-from embomatrix.trainer.learning.likelihood import Example, negative_log_likelihood
+from embomatrix.trainer.learning.likelihood import negative_log_likelihood
 from embomatrix.trainer.learning.objective import LossInputs, LossMetrics, LossTotals, surrogate_loss
-from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
+from embomatrix.trainer.policy.conversation import Conversation
+from embomatrix.trainer.policy.protocol import Example, Policy, Samples, Tokens
+from embomatrix.trainer.policy.tiny import TinyPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +55,35 @@ class Learner:
         self.policy = policy
         self.reference = reference
         self._settings = settings
+        self._conversations: dict[int, Conversation] = {}
 
     def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
         """Draw plans for each prompt with a generator of this seed."""
         device = next(iter(self.policy.parameters())).device
         generator = torch.Generator(device).manual_seed(seed)
         return self.policy.sample(prompts, rule.group, rule.temperature, rule.max_new, generator)
+
+    def converse(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
+        """Begin the conversation of this number, with ``rule.group`` episodes for each prompt."""
+        assert isinstance(self.policy, TinyPolicy), "the settings refuse other policies"
+        generator = torch.Generator(self.policy.device).manual_seed(seed)
+        self._conversations[number] = Conversation(
+            self.policy, prompts, rule.group, rule.temperature, generator
+        )
+
+    def reply(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
+        """Tell episodes of a conversation what happened, unless they begin, and sample their answers.
+
+        An answer is None if the policy has no room for another one.
+        """
+        conversation = self._conversations[number]
+        if told:
+            conversation.tell(rows, told)
+        return conversation.answer(rows)
+
+    def end_conversation(self, number: int) -> Samples:
+        """Return all episodes of a conversation as samples, and forget it."""
+        return self._conversations.pop(number).samples()
 
     @torch.no_grad()
     def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:

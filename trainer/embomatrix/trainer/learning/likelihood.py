@@ -6,22 +6,23 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from embomatrix.trainer.policy.protocol import Policy, Tokens
-
-Example = tuple[Tokens, Tokens]
-"""Prompt and plan."""
+from embomatrix.trainer.policy.protocol import Example, Policy
 
 
 def plan_tokens(examples: Sequence[Example]) -> int:
-    """Return the number of plan tokens in the examples."""
-    return sum(len(plan) for _, plan in examples)
+    """Return the number of tokens in the examples that a policy writes."""
+    return sum(example.own for example in examples)
 
 
 def negative_log_likelihood(policy: Policy, examples: Sequence[Example]) -> Tensor:
-    """Return the negative log-likelihood of the plans in nats, summed over their tokens."""
-    prompts, plans = zip(*examples, strict=True)
+    """Return the negative log-likelihood of the plans in nats, summed over the tokens that a policy writes."""
+    prompts, plans, _ = zip(*examples, strict=True)
     tokens = pad_sequence([torch.tensor(plan) for plan in plans], batch_first=True)
-    mask = pad_sequence([torch.ones(len(plan), dtype=torch.bool) for plan in plans], batch_first=True)
+    mask = pad_sequence([_own(example) for example in examples], batch_first=True)
     device = next(iter(policy.parameters())).device
     scored = policy.logprobs(prompts, tokens.to(device), mask.to(device), group=1, temperature=1.0)
     return -scored.logprobs.sum()
+
+
+def _own(example: Example) -> Tensor:
+    return ~torch.tensor(example.told or (False,) * len(example.plan), dtype=torch.bool)

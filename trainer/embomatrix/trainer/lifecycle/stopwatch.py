@@ -54,6 +54,11 @@ class Stopwatch:
             self.spent_s = before
             raise
 
+    def move(self, seconds: float, source: Activity, target: Activity) -> None:
+        """Count seconds of one activity, which were counted already, as those of another."""
+        for activity, change in ((source, -seconds), (target, seconds)):
+            self.spent_s[activity.value] = self.spent_s.get(activity.value, 0.0) + change
+
     @contextlib.contextmanager
     def track(self, activity: Activity) -> Iterator[None]:
         began_s = time.monotonic()

@@ -45,6 +45,9 @@ class LineDisplay:
         self._clock.note(Phase.IMITATION, progress.share, time.monotonic())
         self._show("imitation", progress.share, figures)
 
+    def playing_oracle(self, done: int, total: int) -> None:
+        self._show("oracle episodes", done / total, {"episodes": f"{done} of {total}"})
+
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._clock.note_evaluation(label, done, total, time.monotonic())
         self._show(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})
@@ -60,8 +63,8 @@ class LineDisplay:
             "reward": f"{record.reward:.2f}",
             "success": f"{record.success:.0%}",
             "rollouts/s": f"{rollouts_per_s:.0f}",
-            "warm starts": f"{record.warm:.0%}",
-            "shared steps": f"{record.shared:.0%}",
+            "warm starts": "–" if record.warm is None else f"{record.warm:.0%}",
+            "shared steps": "–" if record.shared is None else f"{record.shared:.0%}",
             "entropy": "–" if record.entropy is None else f"{record.entropy:.2f}",
             "zero-variance groups": f"{record.zero_variance_groups:.0%}",
         }

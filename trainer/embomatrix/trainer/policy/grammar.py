@@ -3,12 +3,14 @@
 ``PlanGrammar`` belongs to a vocabulary, ``PromptNames`` to a batch of prompts. Both are lookup tables, so the masks of
 all rows are computed at once.
 
+In an episode each answer is one call, and what the policy is told after it may name further things.
+
 Shapes: Q prompts of P tokens, R rows (plans), T tokens of a plan, V words, N number words (``_0`` ``_1`` ...).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -63,6 +65,13 @@ class PromptNames:
             self.stems[prompts], self.unnumbered[prompts], self.numbers[prompts], self.share[prompts]
         )
 
+    def add(self, kind: int, rows: Tensor, stems: Tensor, numbers: Tensor) -> None:
+        """Add names in place: of objects (``kind`` 0) or rooms (1), each with its row, first word and number (names,)."""
+        self.stems[rows, kind, stems] = True
+        self.numbers[rows, stems, numbers] = True
+        count = self.numbers[rows, stems].sum(dim=1) + self.unnumbered[rows, stems]
+        self.share[rows, stems] = 1 / count
+
 
 @dataclass(frozen=True, slots=True)
 class GrammarState:
@@ -83,9 +92,9 @@ class GrammarState:
 
 
 class PlanGrammar:
-    """Grammar tables of one vocabulary."""
+    """Grammar tables of one vocabulary. With ``single_calls``, a text ends after its first call."""
 
-    def __init__(self, vocabulary: Vocabulary, device: torch.device) -> None:
+    def __init__(self, vocabulary: Vocabulary, device: torch.device, *, single_calls: bool = False) -> None:
         size, index = len(vocabulary), vocabulary.index
         self._break, self._task = index[BREAK], index["task"]
         self._pick_up = index.get(Skill.PICK_UP.value, PAD)
@@ -106,8 +115,11 @@ class PlanGrammar:
         relations = [index[relation.value] for relation in PlaceRelation if relation.value in index]
         self._fixed[_Expects.RELATION, relations] = True
         self._fixed[_Expects.QUANTITY, list(vocabulary.quantity_tokens)] = True
-        self._fixed[_Expects.CALL_END] = self._fixed[_Expects.SKILL]
         self._fixed[_Expects.CALL_END, END] = True
+        if single_calls:
+            self._fixed[_Expects.SKILL, END] = True  # nothing more to do
+        else:
+            self._fixed[_Expects.CALL_END] |= self._fixed[_Expects.SKILL]
 
     def prompt_names(self, prompts: Tensor) -> PromptNames:
         """Collect the names in prompts (Q, P), up to the line with the instruction."""
@@ -192,18 +204,149 @@ class PlanGrammar:
         allowed[:, END] |= ~allowed.any(dim=1)
         return ~allowed
 
-    def rules_of_plans(
-        self, tokens: Tensor, names: PromptNames, shortlist: Shortlist
-    ) -> tuple[Tensor, Tensor]:
-        """Return which words of a shortlist are masked at each position of plans (R, T), and their coverage: (R, T, K) each.
+    def after_telling(self, state: GrammarState, told: Tensor) -> GrammarState:
+        """State of plans that go on after the policy was told something: the next answer begins. told (R,) marks them."""
+        return GrammarState(
+            state.skill.masked_fill(told, PAD),
+            state.arguments.masked_fill(told, 0),
+            state.open_stem.masked_fill(told, PAD),
+            state.taken,
+        )
 
-        The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood.
+    def tell(self, names: PromptNames, tokens: Tensor, told: Tensor) -> None:
+        """Add the numbered names in tokens (R, T) of which ``told`` (R, T) were not written by the policy, in place."""
+        for at, rows, kind in self._told_names(tokens, told):
+            names.add(kind, rows, tokens[rows, at - 1], self._number_index[tokens[rows, at]])
+
+    def _told_names(self, tokens: Tensor, told: Tensor) -> Iterator[tuple[int, Tensor, int]]:
+        """Yield the rows in which a name ends at a position, with that position and the kind of the name, in order."""
+        joined = told[:, 1:] & told[:, :-1] & (self._number_index[tokens[:, 1:]] >= 0)  # (R, T - 1)
+        ends = self._stems[:, tokens[:, :-1]] & joined  # (2, R, T - 1)
+        for before in ends.any(dim=1).any(dim=0).nonzero()[:, 0].tolist():
+            for kind in range(2):
+                rows = ends[kind, :, before].nonzero()[:, 0]
+                if len(rows):
+                    yield before + 1, rows, kind
+
+    def rules_of_plans(
+        self,
+        tokens: Tensor,
+        names: PromptNames,
+        shortlist: Shortlist,
+        places: Tensor,
+        told: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return which words of a shortlist are masked at places (R, M) of plans (R, T), and their coverage: (R, M, K) each.
+
+        The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood. ``told`` (R, T) marks
+        tokens that the policy did not write. ``names`` belong to each row's prompt.
         """
+        arguments, open_stems, taken = self._walk(tokens, names, told)
+        argument, open_stem = arguments.gather(1, places), open_stems.gather(1, places)  # (R, M)
+        known = _KnownNames.of(
+            names, [] if told is None else self._told_names(tokens, told), tokens, self._number_index
+        )
+        allowed = self._fixed[argument][..., shortlist.words]  # (R, M, K)
+        for kind, expected in enumerate((_Expects.OBJECT, _Expects.ROOM)):
+            allowed |= known.stems(kind, shortlist.words, places) & (argument == expected)[..., None]
+        is_open = open_stem != PAD
+        whole = names.unnumbered.gather(1, open_stem)  # (R, M): the name so far is complete
+        allowed &= (~is_open | whole)[..., None]
+        columns = shortlist.columns[self._numbers]
+        present = columns >= 0
+        allowed[..., columns[present]] |= (known.numbers(open_stem, places) & is_open[..., None])[
+            ..., present
+        ]
+        allowed[..., shortlist.columns[END]] |= ~allowed.any(dim=2)
+        own = shortlist.columns[tokens.gather(1, places)][..., None]
+        masks = (~allowed).scatter(2, own, False)
+        expects_object = argument == _Expects.OBJECT
+        return masks, self._coverages(taken, known, shortlist, places, open_stem, expects_object)
+
+    def _walk(self, tokens: Tensor, names: PromptNames, told: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what each position of plans expects and its open stem, (R, T) each, and the words taken, (R, T, 2)."""
         state = self.start(len(tokens))
-        masks, coverages = [], []
+        arguments, open_stems = [], []
         for at in range(tokens.shape[1]):
-            mask = self.token_mask(state, names)
-            masks.append(mask.scatter_(1, tokens[:, at, None], False)[:, shortlist.words])
-            coverages.append(self.coverage(state, names, shortlist))
+            arguments.append(self._arguments[state.skill, state.arguments])
+            open_stems.append(state.open_stem)
             state = self.advance(state, tokens[:, at], names)
-        return torch.stack(masks, dim=1), torch.stack(coverages, dim=1)
+            if told is not None:
+                state = self.after_telling(state, told[:, at])
+        taken = state.taken if told is None else state.taken.masked_fill(told[..., None], PAD)
+        return torch.stack(arguments, dim=1), torch.stack(open_stems, dim=1), taken
+
+    def _coverages(
+        self,
+        taken: Tensor,
+        known: _KnownNames,
+        shortlist: Shortlist,
+        places: Tensor,
+        open_stem: Tensor,
+        expects_object: Tensor,
+    ) -> Tensor:
+        """Return the coverage (R, M, K) at places (R, M), as ``coverage`` does for one state."""
+        order = torch.argsort((taken[..., 0] == PAD).int(), dim=1, stable=True)
+        order = order[
+            :, : int((taken[..., 0] != PAD).sum(dim=1).amax())
+        ]  # (R, E): only positions that take a thing
+        stems, numbers = taken.gather(1, order[..., None].expand(-1, -1, 2)).unbind(dim=2)  # (R, E)
+        before = order[:, None] < places[..., None]  # (R, M, E)
+        found = torch.zeros(*places.shape, len(shortlist.words), device=taken.device)
+        shares = known.shares(stems, places) * (before & expects_object[..., None])
+        again = before & (stems[:, None] == open_stem[..., None]) & (stems != PAD)[:, None]
+        found.scatter_add_(2, shortlist.columns[stems][:, None].expand_as(shares), shares)
+        found.scatter_add_(2, shortlist.columns[numbers][:, None].expand_as(again), again.float())
+        found[..., shortlist.columns[PAD]] = 0.0
+        return found.clamp_(max=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _KnownNames:
+    """Names at each position of plans: those of the prompt, and those that the policy was told of before.
+
+    ``number_since`` (R, V, N) and ``stem_since`` (R, 2, V) are the positions after which names are known, -1 for those of the
+    prompt; None if there are no others.
+    """
+
+    prompt: PromptNames
+    number_since: Tensor | None
+    stem_since: Tensor | None
+
+    @staticmethod
+    def of(
+        names: PromptNames, told: Iterable[tuple[int, Tensor, int]], tokens: Tensor, number_index: Tensor
+    ) -> _KnownNames:
+        """Collect the names that rows were told of. ``told`` has positions of the last words of names, rows and kinds."""
+        found = [*told]
+        if not found:
+            return _KnownNames(names, None, None)
+        never = tokens.shape[1] + 1
+        number_since = torch.where(names.numbers, -1, never)
+        stem_since = torch.where(names.stems, -1, never)
+        for at, rows, kind in found:
+            stems, numbers = tokens[rows, at - 1], number_index[tokens[rows, at]]
+            number_since[rows, stems, numbers] = number_since[rows, stems, numbers].clamp(max=at)
+            stem_since[rows, kind, stems] = stem_since[rows, kind, stems].clamp(max=at)
+        return _KnownNames(names, number_since, stem_since)
+
+    def stems(self, kind: int, words: Tensor, places: Tensor) -> Tensor:
+        """Return which words (K,) begin names of a kind at places (R, M): (R, M, K)."""
+        if self.stem_since is None:
+            return self.prompt.stems[:, kind, words][:, None].expand(-1, places.shape[1], -1)
+        return self.stem_since[:, kind, words][:, None] < places[..., None]
+
+    def numbers(self, stems: Tensor, places: Tensor) -> Tensor:
+        """Return which numbers may follow a stem (R, M) at its place (R, M): (R, M, N)."""
+        rows = torch.arange(len(stems), device=stems.device)[:, None]
+        if self.number_since is None:
+            return self.prompt.numbers[rows, stems]
+        return self.number_since[rows, stems] < places[..., None]
+
+    def shares(self, stems: Tensor, places: Tensor) -> Tensor:
+        """Return one name's share of the names with a stem (R, E) at places (R, M): (R, M, E)."""
+        rows = torch.arange(len(stems), device=stems.device)[:, None]
+        if self.number_since is None:
+            return self.prompt.share[rows, stems][:, None].expand(-1, places.shape[1], -1)
+        known = (self.number_since[rows, stems][:, None] < places[:, :, None, None]).sum(dim=3)  # (R, M, E)
+        return 1 / (known + self.prompt.unnumbered[rows, stems][:, None]).clamp(min=1)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import torch
 
+from embomatrix.skills.episode_text import OBSERVATION_WORDS
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.compute_dtype import torch_dtype
@@ -14,7 +16,7 @@ from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.lora import has_adapters
 from embomatrix.trainer.policy.protocol import Policy
-from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.policy.tiny import EPISODE_CONTEXT, TinyPolicy
 from embomatrix.trainer.policy.vocabulary import Vocabulary, build_vocabulary
 
 if TYPE_CHECKING:
@@ -42,10 +44,17 @@ def is_word_level(model: str) -> bool:
 def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
     """Create the initial policy of a run. Raises TrainerError if the model is unknown or can't be loaded."""
     if not is_word_level(settings.model):
+        if settings.episodes.visibility is not None:
+            raise TrainerError(
+                "episodes.visibility is for the word-level policy so far: leave it out, or pass --model tiny; language models "
+                "learn in episodes through TRL (docs/adapters.md)"
+            )
         return _language_model(settings.model, settings)
     if settings.model != TINY:
         check_word_level(settings)
-        return saved_policy(Path(settings.model), settings)
+        policy = saved_policy(Path(settings.model), settings)
+        _check_form(policy, settings)
+        return policy
     vocabulary, shape = word_level_shape(settings, tasks)
     return TinyPolicy(
         vocabulary,
@@ -53,7 +62,20 @@ def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
         seed=settings.seed,
         device=settings.device,
         compute_dtype=torch_dtype(settings.compute_dtype, settings.device),
+        single_calls=settings.episodes.visibility is not None,
     )
+
+
+def _check_form(policy: Policy, settings: TrainSettings) -> None:
+    """Raise TrainerError if a saved policy writes whole plans and the run has episodes, or the other way round."""
+    in_episodes = settings.episodes.visibility is not None
+    if isinstance(policy, TinyPolicy) and policy.single_calls is not in_episodes:
+        found, remedy = (
+            ("the calls of episodes", "set") if policy.single_calls else ("whole plans", "leave out")
+        )
+        raise TrainerError(
+            f"the policy in {settings.model} writes {found}: {remedy} episodes.visibility, or pass another --model"
+        )
 
 
 def check_word_level(settings: TrainSettings) -> None:
@@ -70,12 +92,19 @@ def word_level_shape(settings: TrainSettings, tasks: TaskSet) -> tuple[Vocabular
     check_word_level(settings)
     if settings.model != TINY:
         try:
-            return TinyPolicy.described_in(Path(settings.model))
+            vocabulary, shape, _ = TinyPolicy.described_in(Path(settings.model))
         except DAMAGE as error:
             raise _damaged(Path(settings.model), error) from error
+        return vocabulary, shape
     situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
-    vocabulary = build_vocabulary(situations, [task.task.instruction for task in tasks.train])
-    return vocabulary, DecoderShape(len(vocabulary), **settings.tiny.model_dump())
+    in_episodes = settings.episodes.visibility is not None
+    vocabulary = build_vocabulary(
+        situations,
+        [task.task.instruction for task in tasks.train],
+        OBSERVATION_WORDS if in_episodes else (),
+    )
+    shape = DecoderShape(len(vocabulary), **settings.tiny.model_dump())
+    return vocabulary, replace(shape, longest=EPISODE_CONTEXT) if in_episodes else shape
 
 
 def _damaged(folder: Path, error: BaseException) -> TrainerError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -16,13 +16,27 @@ from embomatrix.skills.prompt import Codec, Prompt
 Tokens = tuple[int, ...]
 
 
+class Example(NamedTuple):
+    """Prompt and plan to imitate. ``told`` is true on tokens of the plan that the policy is told in an episode; empty: none."""
+
+    prompt: Tokens
+    plan: Tokens
+    told: tuple[bool, ...] = ()
+
+    @property
+    def own(self) -> int:
+        """Number of tokens that the policy writes."""
+        return len(self.plan) - sum(self.told)
+
+
 @dataclass(frozen=True, slots=True)
 class Samples:
     """``group`` completions per prompt: row q * group + i is sample i of prompt q.
 
     ``tokens``, ``mask`` and ``logprobs`` have shape (rows, longest completion). ``mask`` is true up to and including the
-    end token. Log-probabilities are at the sampling temperature. ``cut_off`` (rows,) is true for completions that reached
-    the maximum length without an end token.
+    end token. In an episode it is true on the tokens of the policy's answers and false on what the policy was told between
+    them. Log-probabilities are at the sampling temperature. ``cut_off`` (rows,) is true for completions that reached the
+    maximum length without an end token.
     """
 
     tokens: Tensor
@@ -130,6 +144,12 @@ def token_entropy(logprobs: Tensor, *, gradient: bool, minimum: float | None = N
     with torch.set_grad_enabled(gradient and torch.is_grad_enabled()):
         bounded = logprobs if minimum is None else logprobs.clamp(min=minimum)
         return -(bounded.exp() * bounded).sum(dim=-1)
+
+
+def written_lengths(mask: Tensor) -> Tensor:
+    """Return the number of tokens up to each row's last one of its own (rows,). mask: (rows, T), true on own tokens."""
+    places = torch.arange(1, mask.shape[1] + 1, device=mask.device)
+    return (mask * places).amax(dim=1)
 
 
 def pad_left(prompts: Sequence[Tokens], fill: int, device: torch.device) -> tuple[Tensor, Tensor]:

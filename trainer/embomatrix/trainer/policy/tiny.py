@@ -24,7 +24,15 @@ from embomatrix.trainer.policy.decoder import (
     check_weights,
 )
 from embomatrix.trainer.policy.grammar import GrammarState, PlanGrammar, PromptNames
-from embomatrix.trainer.policy.protocol import Samples, Tokens, TokenScores, draw, pad_left, token_entropy
+from embomatrix.trainer.policy.protocol import (
+    Samples,
+    Tokens,
+    TokenScores,
+    draw,
+    pad_left,
+    token_entropy,
+    written_lengths,
+)
 from embomatrix.trainer.policy.tensor_file import read_tensors
 from embomatrix.trainer.policy.vocabulary import END, GO, PAD, Vocabulary
 from embomatrix.world.json_text import parse_json
@@ -39,6 +47,8 @@ _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
 _FORMAT: Final = 3
 """Version of a saved policy. Plans of version 1 had a word between two calls; version 2 had no coverage."""
+EPISODE_CONTEXT: Final = 2048
+"""Tokens of the context of a new policy for episodes."""
 MAX_CONTEXT: Final = 65_536
 """Tokens of the longest context of a saved policy."""
 
@@ -92,7 +102,9 @@ class _SamplingState:
 
 
 class TinyPolicy:
-    """Policy with a ``Decoder`` over a ``Vocabulary``. It writes plans in the ``names`` codec."""
+    """Policy with a ``Decoder`` over a ``Vocabulary``. It writes plans in the ``names`` codec, or with ``single_calls`` the
+    answers of an episode, each with at most one call.
+    """
 
     name = "tiny"
     codec = Codec.NAMES
@@ -105,11 +117,13 @@ class TinyPolicy:
         seed: int,
         device: str = "cpu",
         compute_dtype: torch.dtype = torch.float32,
+        single_calls: bool = False,
     ) -> None:
         self.vocabulary = vocabulary
         self.module = Decoder(shape, torch.Generator().manual_seed(seed), compute_dtype).to(device)
         self.device = torch.device(device)
-        self._grammar = PlanGrammar(vocabulary, self.device)
+        self.single_calls = single_calls
+        self.grammar = PlanGrammar(vocabulary, self.device, single_calls=single_calls)
 
     @property
     def context(self) -> int:
@@ -125,6 +139,10 @@ class TinyPolicy:
 
     def encode_plan(self, text: str) -> Tokens:
         return (*self.vocabulary.encode_plan(text), END)
+
+    def encode_told(self, text: str) -> Tokens:
+        """Return the tokens of what the policy is told in an episode."""
+        return tuple(self.vocabulary.encode(text))
 
     def unknown_words(self, text: str) -> frozenset[str]:
         return self.vocabulary.unknown_words(text)
@@ -148,8 +166,8 @@ class TinyPolicy:
         with frozen_weights(self.module):
             for at in range(max_new):
                 words = state.shortlist.words
-                token_mask = self._grammar.token_mask(state.grammar_state, state.names)[:, None, words]
-                coverage = self._grammar.coverage(state.grammar_state, state.names, state.shortlist)[:, None]
+                token_mask = self.grammar.token_mask(state.grammar_state, state.names)[:, None, words]
+                coverage = self.grammar.coverage(state.grammar_state, state.names, state.shortlist)[:, None]
                 scores = self.module.scores(
                     hidden, state.prompts, state.plan, state.shortlist, token_mask, coverage
                 )
@@ -160,7 +178,7 @@ class TinyPolicy:
                 logprobs[rows, at] = torch.where(active, logprob, 0.0)
                 mask[rows, at] = active
                 length = at + 1
-                state = state.advance(choice, self._grammar)
+                state = state.advance(choice, self.grammar)
                 kept = state.rows_to_keep()
                 if len(kept) == 0:
                     break
@@ -177,11 +195,11 @@ class TinyPolicy:
         """Start ``group`` empty plans per prompt."""
         cache = self.module.encode_prompts(*pad_left(prompts, PAD, self.device))
         rows = torch.arange(len(prompts) * group, device=self.device)
-        names = self._grammar.prompt_names(cache.tokens)
-        shortlist = Shortlist.of(self._grammar.words(names))
+        names = self.grammar.prompt_names(cache.tokens)
+        shortlist = Shortlist.of(self.grammar.words(names))
         active = torch.ones(len(rows), dtype=torch.bool, device=self.device)
         return _SamplingState(
-            rows, active, cache, shortlist, names.select(rows // group), self._grammar.start(len(rows)), None
+            rows, active, cache, shortlist, names.select(rows // group), self.grammar.start(len(rows)), None
         )
 
     def logprobs(
@@ -196,24 +214,30 @@ class TinyPolicy:
     ) -> TokenScores:
         cache = self.module.encode_prompts(*pad_left(prompts, PAD, self.device))
         prompt_of_row = torch.arange(len(tokens), device=self.device) // group
-        names = self._grammar.prompt_names(cache.tokens)
-        included = self._grammar.words(names)
+        names = self.grammar.prompt_names(cache.tokens)
+        included = self.grammar.words(names)
         included[tokens] = True  # other sources' plans may break the grammar
         shortlist = Shortlist.of(included)
-        token_masks, coverages = self._grammar.rules_of_plans(tokens, names.select(prompt_of_row), shortlist)
-        lengths = mask.sum(dim=1)
+        lengths = written_lengths(mask)
+        told = ~mask & (torch.arange(tokens.shape[1], device=self.device) < lengths[:, None])  # (rows, T)
+        in_episodes = bool(told.any())
+        places = _own_places(mask) if in_episodes else _all_places(tokens)
+        token_masks, coverages = self.grammar.rules_of_plans(
+            tokens, names.select(prompt_of_row), shortlist, places, told if in_episodes else None
+        )
         order = torch.argsort(lengths, stable=True)
         scores = []
         for rows in order.tensor_split(min(_LENGTH_BUCKETS, len(order))):
             length = max(1, int(lengths[rows].max()))
-            bucket = cache.select(prompt_of_row[rows])
+            count = max(1, int(mask[rows].sum(dim=1).max())) if in_episodes else length
             scores.append(
                 self._score(
-                    bucket,
+                    cache.select(prompt_of_row[rows]),
                     tokens[rows, :length],
                     shortlist,
-                    token_masks[rows, :length],
-                    coverages[rows, :length],
+                    places[rows, :count] if in_episodes else None,
+                    token_masks[rows, :count],
+                    coverages[rows, :count],
                     temperature,
                     entropy_gradient,
                 )
@@ -231,23 +255,34 @@ class TinyPolicy:
         prompts: PromptCache,
         tokens: Tensor,
         shortlist: Shortlist,
+        places: Tensor | None,
         token_masks: Tensor,
         coverages: Tensor,
         temperature: float,
         entropy_gradient: bool,
     ) -> tuple[Tensor, Tensor]:
-        """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks, coverages: (rows, T, K)."""
+        """Return log-probability and entropy (rows, T) of tokens (rows, T). token_masks, coverages: (rows, M, K).
+
+        Only tokens at ``places`` (rows, M) are scored, all if it is None.
+        """
         hidden, plan = prompts.last, None  # (rows, 1, C)
         if tokens.shape[1] > 1:
             rest, plan = self.module.extend(prompts, tokens[:, :-1], None)
             hidden = torch.cat([hidden, rest], dim=1)  # (rows, T, C)
+        if places is not None:
+            hidden = hidden.gather(1, places[..., None].expand(-1, -1, hidden.shape[2]))  # (rows, M, C)
         scores = torch.log_softmax(
-            self.module.scores(hidden, prompts, plan, shortlist, token_masks, coverages)
+            self.module.scores(hidden, prompts, plan, shortlist, token_masks, coverages, places)
             / (temperature or 1.0),
             dim=-1,
-        )  # (rows, T, K)
-        chosen = scores.gather(-1, shortlist.columns[tokens][..., None])[..., 0]
-        return chosen, token_entropy(scores, gradient=entropy_gradient, minimum=_MIN_LOGPROB)
+        )  # (rows, M, K)
+        scored = tokens if places is None else tokens.gather(1, places)
+        chosen = scores.gather(-1, shortlist.columns[scored][..., None])[..., 0]
+        entropy = token_entropy(scores, gradient=entropy_gradient, minimum=_MIN_LOGPROB)
+        if places is None:
+            return chosen, entropy
+        empty = chosen.new_zeros(tokens.shape)
+        return empty.scatter(1, places, chosen), empty.scatter(1, places, entropy)
 
     def frozen_copy(self) -> TinyPolicy:
         twin = copy.copy(self)
@@ -263,23 +298,27 @@ class TinyPolicy:
             "words": self.vocabulary.words,
             "objects": self.vocabulary.object_words,
             "rooms": self.vocabulary.room_words,
+            "single_calls": self.single_calls,
         }
         (folder / _DESCRIPTION).write_text(json.dumps(description))
 
     @classmethod
     def load(cls, folder: Path, *, device: str = "cpu", compute_dtype: torch.dtype = torch.float32) -> Self:
         """Load a policy that ``save`` wrote. Raises OSError, ValueError or RuntimeError if it is damaged."""
-        vocabulary, shape = cls.described_in(folder)
+        vocabulary, shape, single_calls = cls.described_in(folder)
         weights = read_tensors(folder / _WEIGHTS, device=device)
         check_weights(shape, weights)
-        policy = cls(vocabulary, shape, seed=0, device=device, compute_dtype=compute_dtype)
+        policy = cls(
+            vocabulary, shape, seed=0, device=device, compute_dtype=compute_dtype, single_calls=single_calls
+        )
         policy.module.load_state_dict(weights)
         return policy
 
     @staticmethod
-    def described_in(folder: Path) -> tuple[Vocabulary, DecoderShape]:
-        """Read the vocabulary and the shape of a saved policy, not its weights. Raises OSError, ValueError, TypeError or
-        LookupError if the description is damaged.
+    def described_in(folder: Path) -> tuple[Vocabulary, DecoderShape, bool]:
+        """Read the vocabulary and the shape of a saved policy, and whether it writes single calls, not its weights.
+
+        Raises OSError, ValueError, TypeError or LookupError if the description is damaged.
         """
         description = parse_json((folder / _DESCRIPTION).read_bytes())
         if not isinstance(description, dict):
@@ -297,8 +336,19 @@ class TinyPolicy:
                 f"{_DESCRIPTION} has {len(vocabulary)} words and a context of {shape.longest}: expected {shape.vocabulary} "
                 f"words, and 1 to {MAX_CONTEXT}"
             )
-        return vocabulary, shape
+        return vocabulary, shape, bool(description.get("single_calls", False))
 
     @staticmethod
     def is_saved_in(folder: Path) -> bool:
         return (folder / _DESCRIPTION).is_file()
+
+
+def _all_places(tokens: Tensor) -> Tensor:
+    """Return every place of the rows (rows, T)."""
+    return torch.arange(tokens.shape[1], device=tokens.device).expand(tokens.shape)
+
+
+def _own_places(mask: Tensor) -> Tensor:
+    """Return the places of each row's own tokens (rows, M), then others up to the largest number M of own tokens."""
+    order = torch.argsort((~mask).int(), dim=1, stable=True)
+    return order[:, : max(1, int(mask.sum(dim=1).max()))]

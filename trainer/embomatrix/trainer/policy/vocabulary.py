@@ -43,9 +43,14 @@ _FIXED_WORDS: Final = (
 )
 
 
-def build_vocabulary(situations: Iterable[Situation], instructions: Iterable[str]) -> Vocabulary:
-    """Build the vocabulary of tasks from the object tables in ``situations`` and the training ``instructions``."""
-    words: dict[str, None] = dict.fromkeys(_FIXED_WORDS)
+def build_vocabulary(
+    situations: Iterable[Situation], instructions: Iterable[str], further: Iterable[str] = ()
+) -> Vocabulary:
+    """Build the vocabulary of tasks from the object tables in ``situations`` and the training ``instructions``.
+
+    ``further`` are words of other texts that the policy is told.
+    """
+    words: dict[str, None] = dict.fromkeys((*_FIXED_WORDS, *further))
     object_stems: dict[str, None] = {}
     room_stems: dict[str, None] = {}
     numbers = {0}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from embomatrix.trainer.episodes.oracle import OracleExamples
 from embomatrix.trainer.imitation.teacher_forcing import Imitation, ImitationProgress
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, restore
@@ -23,16 +24,20 @@ def run_imitation(
     out: Path,
     recorder: Recorder,
     report: Callable[[ImitationProgress], None],
+    episodes: OracleExamples | None = None,
 ) -> None:
-    """Use up the imitation budget and keep the progress current. A checkpoint is always left. Raises TrainerError."""
+    """Use up the imitation budget and keep the progress current. A checkpoint is always left. Raises TrainerError.
+
+    ``episodes`` are imitated instead of plans, if they are given.
+    """
     policy, progress, settings = start.policy, start.progress, start.settings
     store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
     state = progress.imitation
     imitation = Imitation(
         policy,
         workers,
-        start.prompt_builder,
-        start.tasks.train,
+        episodes or start.prompt_builder,
+        episodes.tasks if episodes else start.tasks.train,
         settings.imitation,
         seed=settings.seed,
         state=state,

@@ -7,21 +7,27 @@ import functools
 import logging
 import resource
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from embomatrix.skills.seeds import training_seed
+from embomatrix.skills.seeds import evaluation_seed, training_seed
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.settings import SeedPer
 from embomatrix.trainer.data.tasks import Curriculum, Schedule
+from embomatrix.trainer.episodes.oracle import OracleExamples, oracle_episodes
+from embomatrix.trainer.episodes.players import EpisodePlayers, EpisodeStart
+from embomatrix.trainer.episodes.terms import EpisodeTerms
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
+from embomatrix.trainer.evaluation.held_out_episodes import evaluate_in_episodes
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord
+from embomatrix.trainer.grpo.sampling import EpisodeSampler, Sampler
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
+from embomatrix.trainer.learning.learner import SamplingRule
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, atomic_folder, restore
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
@@ -31,6 +37,7 @@ from embomatrix.trainer.logging.outcome import RunOutcome, write_outcome
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
 from embomatrix.trainer.logging.report import REPORT, TrainedOn, TrainingSummary, rates_of, write_report
 from embomatrix.trainer.logging.trackers import Tracker
+from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.run.imitation import run_imitation
 from embomatrix.trainer.run.starting import REFERENCE, RunStart
 from embomatrix.trainer.serving.sampler import ServerSampler
@@ -67,6 +74,7 @@ class TrainingRun:
         self._store = CheckpointStore(out / CHECKPOINTS, keep=start.settings.keep_checkpoints)
         self._reporter = DashboardReporter(gateway.report)
         self._recorder = Recorder(out, (*trackers, self._reporter))
+        self._terms = EpisodeTerms.of(start.settings.episodes)
         device = next(iter(start.policy.parameters())).device
         self._generator = torch.Generator(device).manual_seed(start.settings.seed)
 
@@ -91,15 +99,7 @@ class TrainingRun:
     def _grpo(self, workers: DataParallelWorkers) -> Path:
         """Run GRPO on all data-parallel workers. Return the last checkpoint."""
         start, settings = self._start, self._settings
-        updater = Updater(
-            start.policy,
-            workers,
-            start.prompt_builder,
-            self._gateway,
-            settings.grpo,
-            self._stopwatch,
-            self._server,
-        )
+        updater = Updater(start.policy, workers, self._sampler(workers), settings.grpo, self._stopwatch)
         newest = self._store.latest() if self._resumed else None
         if newest is not None:
             restore(newest, functools.partial(self._load_tensors, updater))
@@ -113,6 +113,31 @@ class TrainingRun:
             raise
         return self._save(updater)
 
+    def _sampler(self, workers: DataParallelWorkers) -> Sampler:
+        start, settings, builder = self._start, self._settings.grpo, self._start.prompt_builder
+        if self._terms is not None:
+            return EpisodeSampler(workers, start.policy, builder, self._gateway, settings, self._terms)
+        return Sampler(workers, start.policy.codec, builder, self._gateway, settings, self._server)
+
+    def _oracle_examples(self) -> OracleExamples | None:
+        """Play or read the oracle's episodes, if the policy plays episodes and shall imitate."""
+        start, terms, policy = self._start, self._terms, self._start.policy
+        settings = self._settings.imitation
+        if terms is None or not isinstance(policy, TinyPolicy) or (settings.steps or settings.seconds) == 0:
+            return None
+        starts = [
+            EpisodeStart(
+                task,
+                start.prompt_builder.told_oracle(task, seen=terms.sight),
+                training_seed(self._settings.seed, task.task.task_id, 0),
+            )
+            for task in start.tasks.train
+            if task.oracle
+        ]
+        players = EpisodePlayers(self._gateway, terms, policy.codec)
+        episodes = oracle_episodes(self._out, starts, players, self._display.playing_oracle)
+        return OracleExamples(episodes, policy, start.tasks.train)
+
     def _load_tensors(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])
         self._generator.set_state(tensors["generator"])
@@ -121,7 +146,8 @@ class TrainingRun:
         """Run imitation and the first evaluation, and save the reference policy."""
         policy, progress = self._start.policy, self._progress
         with self._stopwatch.track(Activity.IMITATION):
-            run_imitation(self._start, workers, self._out, self._recorder, self._display.imitation)
+            episodes = self._oracle_examples()
+            run_imitation(self._start, workers, self._out, self._recorder, self._display.imitation, episodes)
         self._publish()
         before = self._evaluate(BEFORE, self._settings.evaluation.samples, workers)
         progress.before = before.as_json() if before else []
@@ -134,23 +160,58 @@ class TrainingRun:
         tasks = start.evaluated
         if not tasks:
             return None
+
+        def report(done: int, total: int) -> None:
+            self._display.evaluating(label, done, total)
+
         with self._stopwatch.track(Activity.EVALUATION):
-            result = evaluate_policy(
-                workers,
-                start.prompt_builder,
-                tasks,
-                self._gateway,
-                settings.evaluation,
-                samples=samples,
-                max_new=settings.grpo.max_new,
-                seed=settings.seed,
-                label=f"{label.replace(' ', '-')}-{step}",
-                report=lambda done, total: self._display.evaluating(label, done, total),
-                server=self._server,
-            )
+            if self._terms is not None:
+                result = self._evaluate_in_episodes(self._terms, samples, workers, report)
+            else:
+                result = evaluate_policy(
+                    workers,
+                    start.prompt_builder,
+                    tasks,
+                    self._gateway,
+                    settings.evaluation,
+                    samples=samples,
+                    max_new=settings.grpo.max_new,
+                    seed=settings.seed,
+                    label=f"{label.replace(' ', '-')}-{step}",
+                    report=report,
+                    server=self._server,
+                )
         self._display.evaluated(label, result)
         self._recorder.evaluation(step, label, result)
         return result
+
+    def _evaluate_in_episodes(
+        self,
+        terms: EpisodeTerms,
+        samples: int,
+        workers: DataParallelWorkers,
+        report: Callable[[int, int], None],
+    ) -> HeldOutEvaluation:
+        start, settings, seed = self._start, self._settings.evaluation, self._settings.seed
+        self._gateway.announce({0: start.evaluated}, samples)
+        starts = [
+            EpisodeStart(
+                task,
+                start.prompt_builder.told(task, seen=terms.sight),
+                evaluation_seed(seed, task.task.task_id),
+            )
+            for task in start.evaluated
+        ]
+        return evaluate_in_episodes(
+            workers,
+            start.policy,
+            starts,
+            EpisodePlayers(self._gateway, terms, start.policy.codec),
+            SamplingRule(samples, settings.temperature, self._settings.grpo.max_new),
+            chunk=settings.chunk,
+            seed=seed,
+            report=report,
+        )
 
     def _evaluate_if_due(self, done: set[int], workers: DataParallelWorkers) -> None:
         """Evaluate after every so many steps. ``done`` are the steps with an evaluation; a resumed run repeats none."""

@@ -1,0 +1,161 @@
+"""Training call by call, on a real cluster."""
+
+import asyncio
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from rich.console import Console
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.real_cluster import RealCluster, connected
+
+from embomatrix.rpc.episodes import TurnFailedError
+from embomatrix.rpc.wire.values import InfraCode, InfraFailure
+from embomatrix.skills.parse import DONE
+from embomatrix.trainer.cluster.gateway import Gateway
+from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.episodes.oracle import ORACLE_EPISODES
+from embomatrix.trainer.episodes.players import ClusterEpisode
+from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
+from embomatrix.trainer.logging.display import LineDisplay
+from embomatrix.trainer.logging.evaluations import read_evaluations
+from embomatrix.trainer.logging.recorder import read_metrics
+from embomatrix.trainer.policy.loading import new_policy, saved_policy
+from embomatrix.trainer.run.loop import TrainingRun
+from embomatrix.trainer.run.starting import RunStart
+
+pytestmark = pytest.mark.timeout(300)
+SETTINGS = {
+    "tiny.layers": 1,
+    "tiny.width": 32,
+    "tiny.heads": 2,
+    "tiny.inner": 32,
+    "episodes.visibility": "seen",
+    "episodes.calls_more": 2,
+    "imitation.steps": 12,
+    "imitation.batch": 4,
+    "grpo.steps": 3,
+    "grpo.tasks_per_step": 3,
+    "grpo.group": 3,
+    "grpo.chunk": 1,
+    "grpo.kl_coef": 0.05,
+    "grpo.zero_variance": "keep",
+    "evaluation.samples": 2,
+    "samples_every": 1,
+    "checkpoint_every": 1,
+}
+TIMES = ("seconds", "spent_s")
+
+
+async def ready(cluster):
+    async with cluster.client() as client:
+        await connected(client, "w1")
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    with RealCluster(tmp_path_factory.mktemp("cluster")) as started:
+        started.start_manager()
+        started.start_real_worker("w1")
+        asyncio.run(ready(started))
+        yield started
+
+
+@pytest.fixture(scope="module")
+def tasks(tmp_path_factory):
+    return load_tasks(write_kitchen_dataset(tmp_path_factory.mktemp("dataset")))
+
+
+def train(cluster, tasks, out, *, resume=False, **changes):
+    """Run a training in ``out``, which it continues from its newest checkpoint with ``resume``. Return its policy."""
+    given = {name.replace("__", "."): value for name, value in changes.items()}
+    settings = read_settings(None, {**SETTINGS, **given})
+    progress = TrainingProgress()
+    if resume:
+        newest = CheckpointStore(out / CHECKPOINTS, keep=9).latest()
+        progress, settings = read_state(newest)
+        policy = saved_policy(newest / "policy", settings)
+        reference = saved_policy(out / "reference", settings).frozen_copy()
+    else:
+        policy, reference = new_policy(settings, tasks), None
+    display = LineDisplay(Console(quiet=True))
+    out.mkdir(exist_ok=True)
+    with Gateway(cluster.client, tasks.bundle_bytes, run_name="episodes") as gateway, display:
+        TrainingRun(RunStart(settings, tasks, policy, progress, reference), gateway, display, out).run()
+    return policy
+
+
+def figures(out):
+    return [{key: value for key, value in row.items() if key not in TIMES} for row in read_metrics(out)]
+
+
+def weights(policy):
+    return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
+
+
+def test_equal_runs_have_equal_episodes_and_weights_in_any_number_of_processes(cluster, tasks, tmp_path):
+    first = train(cluster, tasks, tmp_path / "one")
+    second = train(cluster, tasks, tmp_path / "two", processes=2)
+    assert torch.equal(weights(first), weights(second))
+    assert figures(tmp_path / "one") == figures(tmp_path / "two")
+    for row in figures(tmp_path / "one"):
+        assert (row["rollouts"], row["lost"]) == (9, 0)
+        assert abs(row["kl_to_old"]) < 1e-6  # what was sampled is what is trained on
+
+
+def test_resumed_run_equals_an_uninterrupted_one(cluster, tasks, tmp_path):
+    whole = train(cluster, tasks, tmp_path / "whole")
+    train(cluster, tasks, tmp_path / "halves", keep_checkpoints=9)
+    for step in (2, 3):  # as if the run had been killed after its first step
+        folder = tmp_path / "halves" / CHECKPOINTS / f"step-{step:06d}"
+        for path in sorted(folder.rglob("*"), reverse=True):
+            path.unlink() if path.is_file() else path.rmdir()
+        folder.rmdir()
+    resumed = train(cluster, tasks, tmp_path / "halves", resume=True)
+    assert torch.equal(weights(whole), weights(resumed))
+    assert figures(tmp_path / "whole") == figures(tmp_path / "halves")
+
+
+def test_imitation_of_the_oracle_s_episodes_solves_the_training_tasks(cluster, tasks, tmp_path):
+    known = replace(tasks, heldout=tasks.train)
+    changes = {"imitation__steps": 150, "grpo__steps": 0, "evaluation__temperature": 0.0, "tiny__width": 64}
+    train(cluster, known, tmp_path / "run", **changes)
+    episodes = json.loads((tmp_path / "run" / ORACLE_EPISODES).read_text())
+    assert set(episodes) == {task.task.task_id for task in tasks.train}
+    assert all(turns[-1][0] == DONE for _, *turns in episodes.values())
+    evaluation = read_evaluations(tmp_path / "run")[-1]
+    assert all(answer.verdict.success for answer in evaluation.answers)
+    assert json.loads(evaluation.answers[0].text)[-1] == DONE
+
+
+def test_costs_of_calls_are_subtracted_from_the_reward(cluster, tasks, tmp_path):
+    train(cluster, tasks, tmp_path / "free", grpo__steps=1)
+    train(cluster, tasks, tmp_path / "dear", grpo__steps=1, episodes__call_cost=0.25)
+    (free,), (dear,) = figures(tmp_path / "free"), figures(tmp_path / "dear")
+    assert dear["plan_steps"] == free["plan_steps"] > 0
+    calls = free["plan_steps"] * free["well_formed"]  # without those that answer nothing
+    expected = free["reward"] - 0.25 * calls
+    assert dear["reward"] == pytest.approx(expected)
+
+
+def test_a_turn_without_a_result_loses_the_episode_and_not_the_run():
+    class Player:
+        end = None
+
+        async def answer(self, text):
+            raise TurnFailedError("three attempts failed", InfraFailure(InfraCode.SLOT_CRASHED, "it crashed"))
+
+    episode = ClusterEpisode(Player())
+    assert asyncio.run(episode.answer("move 1")) == ""
+    assert episode.is_over
+    outcome = episode.outcome("move 1")
+    assert (outcome.reward, outcome.lost) == (None, "slot_crashed: it crashed")
+
+
+def test_language_models_are_refused(tasks):
+    settings = read_settings(None, {"model": "some/model", "episodes.visibility": "seen"})
+    with pytest.raises(TrainerError, match="for the word-level policy so far"):
+        new_policy(settings, tasks)

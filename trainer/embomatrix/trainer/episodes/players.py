@@ -1,0 +1,115 @@
+"""Episodes of a training run on the cluster: answers in, observations out, while the trainer computes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from embomatrix.envs.player import EpisodePlayer
+from embomatrix.envs.rules import EpisodeEnd
+from embomatrix.rpc.episodes import TurnFailedError
+from embomatrix.rpc.wire.values import InfraCode, InfraFailure
+from embomatrix.skills.prompt import Codec, Prompt
+from embomatrix.skills.turns import PrefixMismatchError
+from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
+from embomatrix.trainer.episodes.terms import EpisodeTerms
+
+if TYPE_CHECKING:
+    from embomatrix.skills.prompt import Situation
+    from embomatrix.trainer.data.tasks import TrainingTask
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeStart:
+    """Start of an episode: a task, its situation as the policy is told of it, and the seed of the simulation."""
+
+    task: TrainingTask
+    situation: Situation
+    seed: int
+
+
+class ClusterEpisode:
+    """One episode on the cluster. ``opening`` is its first text, None if the infrastructure lost the episode before."""
+
+    def __init__(self, player: EpisodePlayer) -> None:
+        self.player = player
+        self.opening: Prompt | None = None
+        self.lost: InfraFailure | None = None
+
+    @property
+    def is_over(self) -> bool:
+        return self.lost is not None or self.player.end is not None
+
+    def stop(self) -> None:
+        """End the episode because the policy has no room for another answer."""
+        self.player.stop(EpisodeEnd.TOKENS)
+
+    async def begin(self) -> None:
+        """Fetch the opening. Raises ClusterError if the manager can't be reached."""
+        self.opening = await self._try(self.player.begin)
+
+    async def answer(self, text: str) -> str:
+        """Take an answer and return what the policy is told. Raises ClusterError if the manager can't be reached."""
+        observation = await self._try(lambda: self.player.answer(text))
+        return "" if observation is None else observation.text
+
+    async def _try(self, work: Callable[[], Awaitable[T]]) -> T | None:
+        """Return the result of a turn. Without one the episode is lost, which says nothing about the policy."""
+        try:
+            return await work()
+        except TurnFailedError as error:
+            self.lost = error.failure or InfraFailure(InfraCode.WORKER_LOST, str(error))
+        except PrefixMismatchError as error:
+            self.lost = InfraFailure(InfraCode.PREFIX_MISMATCH, str(error))
+        return None
+
+    def outcome(self, text: str) -> PlanOutcome:
+        """Return the outcome of the episode, whose answers are ``text``."""
+        if self.lost is not None:
+            return PlanOutcome(text, None, self.lost)
+        reward, steps = self.player.reward, tuple(self.player.steps)
+        problem = "" if steps else "the episode has no call"
+        return PlanOutcome(text, reward.tiers, problem=problem, cost=reward.cost, played=steps)
+
+
+class EpisodePlayers:
+    """Plays episodes through a gateway. Call its methods from any thread."""
+
+    def __init__(self, gateway: Gateway, terms: EpisodeTerms, codec: Codec) -> None:
+        self._gateway = gateway
+        self._terms = terms
+        self._codec = codec
+
+    def begin(self, starts: Sequence[EpisodeStart]) -> Future[list[ClusterEpisode]]:
+        """Begin episodes. The future fails with ClusterError if the manager can't be reached."""
+        return self._gateway.run(self.begin_all(starts))
+
+    def run(self, work: Coroutine[Any, Any, T]) -> Future[T]:
+        """Start work that plays episodes, on the gateway's thread."""
+        return self._gateway.run(work)
+
+    async def begin_all(self, starts: Sequence[EpisodeStart]) -> list[ClusterEpisode]:
+        """Begin episodes, on the gateway's thread. Raises ClusterError if the manager can't be reached."""
+        episodes = []
+        for start in starts:
+            running = await self._gateway.begin_episode(start.task, start.seed, sight=self._terms.sight)
+            rules = self._terms.rules(start.task.oracle)
+            player = EpisodePlayer(running, start.situation, rules, self._codec, self._gateway.reward)
+            episodes.append(ClusterEpisode(player))
+        await _all(episode.begin() for episode in episodes)
+        return episodes
+
+    def answer(self, episodes: Sequence[ClusterEpisode], texts: Sequence[str]) -> Future[list[str]]:
+        """Give each episode an answer. The future has what the policy is told after each, and fails as that of ``begin``."""
+        return self._gateway.run(
+            _all(episode.answer(text) for episode, text in zip(episodes, texts, strict=True))
+        )
+
+
+async def _all(work: Iterable[Awaitable[T]]) -> list[T]:
+    return list(await asyncio.gather(*work))
