@@ -274,7 +274,9 @@ def table() -> dict[str, Decoder]:
         "episodes of the oracle": Decoder(
             _oracle_episodes,
             (TrainerError,),
-            lambda: (b'{"task": ["room kitchen_0", ["open fridge", "did"], ["done", "robot kitchen_0"]]}',),
+            lambda: (
+                b'{"version": {}, "episodes": {"task": ["room kitchen_0", ["open fridge", "did"], ["done", "robot"]]}}',
+            ),
             frozenset({"trainer.episodes.oracle:read_episodes"}),
             mutate_json,
         ),

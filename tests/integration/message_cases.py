@@ -232,6 +232,12 @@ COMMANDS = (
         "episodes.visibility",
         "pass --model tiny",
     ),
+    CommandCase(
+        "memory of episodes",
+        "train --plan-memory=tiny --episodes=seen --dataset=KITCHEN",
+        "plan of memory",
+        "leave out episodes.visibility",
+    ),
     CommandCase("unknown visibility", "train --episodes=half --dataset=KITCHEN", "half", "full"),
     CommandCase("negative minutes", "train --minutes=-1", "--minutes", "greater than or equal to 0"),
     CommandCase("option without number", "train --steps=many", "--steps", "valid integer"),

@@ -102,7 +102,7 @@ def demo(
     if episodes is not None:
         bench = f"--bench {dataset} --visibility {episodes.value}"
         typer.echo(f"try next: embomatrix eval --model {folder} --interactive --samples 1 {bench}")
-    elif task_id:
+    elif task_id and not is_named:
         # Rich would wrap a line that is meant to be copied.
         typer.echo(f"try next: embomatrix play {task_id} --policy {folder} --dataset {dataset}")
 

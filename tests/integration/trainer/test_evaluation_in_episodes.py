@@ -19,6 +19,7 @@ from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
+from embomatrix.trainer.evaluation.conversing import converse_in_episodes
 from embomatrix.trainer.evaluation.episodes import (
     EpisodeExam,
     EpisodeStage,
@@ -31,7 +32,10 @@ from embomatrix.trainer.evaluation.replanning import ReplanningSubject, WrittenP
 from embomatrix.trainer.evaluation.table import report_of, text_report
 from embomatrix.trainer.evaluation.taxonomy import Cause
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
-from embomatrix.trainer.policy.loading import new_policy
+from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.loading import new_policy, word_level_shape
+from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.policy.vocabulary import END
 
 APPLE = "apple_to_counter"
 SOLVED = ("move 10", "pick_up 10", "move 0", "place 0 ontop", "done")
@@ -232,13 +236,54 @@ def test_policy_writes_another_plan_when_the_robot_has_seen_something_new(apple,
     assert json.loads(answers[0].text) == ["go_to_room living_room_0", "turn 1.0", "turn 1.0", "done"]
 
 
-def test_command_plays_episodes_with_a_policy_and_repeats_them(bench, tmp_path):
+def write_run(folder, bench, **changes):
+    """Write a run of a small policy that has learnt nothing."""
     tasks = load_tasks(bench.folder)
-    settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16})
+    shape = {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16}
+    settings = read_settings(None, {**shape, **changes})
     progress = TrainingProgress(step=1, grpo_ready=True)
-    CheckpointStore(tmp_path / "run" / CHECKPOINTS, keep=1).save(
-        new_policy(settings, tasks), {}, progress, settings
-    )
+    CheckpointStore(folder / CHECKPOINTS, keep=1).save(new_policy(settings, tasks), {}, progress, settings)
+
+
+def test_command_plays_with_a_policy_for_episodes_and_judges_it_again(bench, tmp_path):
+    write_run(tmp_path / "run", bench, **{"episodes.visibility": "seen"})
+    where = (f"--bench={bench.folder}", f"--out={tmp_path / 'out'}")
+    playing = (f"--model={tmp_path / 'run'}", "--interactive", "--visibility=seen", "--samples=3")
+    code, printed = run_evaluation(*where, *playing)
+    assert code == 0, printed
+    answers = [json.loads(line) for line in (tmp_path / "out" / "answers.jsonl").read_text().splitlines()]
+    said = [text for each in answers if "text" in each for text in json.loads(each["text"])]
+    assert len({len(json.loads(each["text"])) for each in answers if "text" in each}) > 1
+    assert all("\n" not in text for text in said)
+    before = (tmp_path / "out" / "report.json").read_bytes()
+    again = f"--answers={tmp_path / 'out' / 'answers.jsonl'}"
+    assert run_evaluation(again, f"--bench={bench.folder}")[0] == 0
+    assert (tmp_path / "out" / "report.json").read_bytes() == before
+    code, printed = run_evaluation(*where, f"--model={tmp_path / 'run'}")
+    assert (code, "was trained in episodes and writes no plans: pass --interactive" in printed) == (2, True)
+
+
+def test_a_policy_without_room_for_another_answer_ends_its_episode(apple, tmp_path):
+    tasks = load_tasks(apple.folder)
+    settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16})
+    vocabulary = word_level_shape(settings, tasks)[0]
+    shape = DecoderShape(len(vocabulary), 1, 16, 2, 16, longest=200)
+    policy = TinyPolicy(vocabulary, shape, seed=1, single_calls=True)
+    policy.grammar._fixed[0, END] = False  # it never says that it is done
+    setup = replace(setup_of(apple, calls_factor=9.0, calls_more=64), codec="names")
+    exam = exam_of(apple)
+    with AnswerSheet(tmp_path / "answers.jsonl", setup) as sheet:
+        converse_in_episodes(policy, exam.stage, exam.questions(Codec.NAMES, 60), sheet, lambda *_: None)
+        answers = sheet.ordered(exam.task_ids)
+    (task,) = exam.judge(setup, answers, lambda *_: None).board.tasks
+    (verdict,) = task.verdicts
+    assert 2 < verdict.steps < 64
+    assert verdict.reason == "unfinished" or verdict.step == verdict.steps
+    assert len(json.loads(answers[0].text)) == verdict.steps
+
+
+def test_command_plays_episodes_with_a_policy_and_repeats_them(bench, tmp_path):
+    write_run(tmp_path / "run", bench)
     common = (
         f"--model={tmp_path / 'run'}",
         "--interactive",

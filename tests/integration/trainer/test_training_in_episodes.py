@@ -17,8 +17,8 @@ from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.episodes.client import ClusterEpisode
 from embomatrix.trainer.episodes.oracle import ORACLE_EPISODES
-from embomatrix.trainer.episodes.players import ClusterEpisode
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.evaluations import read_evaluations
@@ -123,7 +123,7 @@ def test_imitation_of_the_oracle_s_episodes_solves_the_training_tasks(cluster, t
     known = replace(tasks, heldout=tasks.train)
     changes = {"imitation__steps": 150, "grpo__steps": 0, "evaluation__temperature": 0.0, "tiny__width": 64}
     train(cluster, known, tmp_path / "run", **changes)
-    episodes = json.loads((tmp_path / "run" / ORACLE_EPISODES).read_text())
+    episodes = json.loads((tmp_path / "run" / ORACLE_EPISODES).read_text())["episodes"]
     assert set(episodes) == {task.task.task_id for task in tasks.train}
     assert all(turns[-1][0] == DONE for _, *turns in episodes.values())
     evaluation = read_evaluations(tmp_path / "run")[-1]
@@ -151,8 +151,28 @@ def test_a_turn_without_a_result_loses_the_episode_and_not_the_run():
     episode = ClusterEpisode(Player())
     assert asyncio.run(episode.answer("move 1")) == ""
     assert episode.is_over
-    outcome = episode.outcome("move 1")
-    assert (outcome.reward, outcome.lost) == (None, "slot_crashed: it crashed")
+    outcome = episode.outcome()
+    assert (outcome.text, outcome.reward, outcome.lost) == ("move 1", None, "slot_crashed: it crashed")
+
+
+def test_episodes_of_the_oracle_are_played_again_if_the_run_is_another(cluster, tasks, tmp_path):
+    changes = {"imitation__steps": 1, "grpo__steps": 0, "evaluation__samples": 1}
+    train(cluster, tasks, tmp_path / "run", **changes)
+    path = tmp_path / "run" / ORACLE_EPISODES
+    seen = path.read_text()
+    path.write_text(seen.replace("pick_up", "open"))
+    kept = path.read_text()
+    train(cluster, tasks, tmp_path / "run", **changes)
+    assert path.read_text() == kept
+    train(cluster, tasks, tmp_path / "run", episodes__visibility="full", **changes)
+    told = json.loads(path.read_text())
+    assert told["version"]["episodes"]["visibility"] == "full"
+    assert "pick_up" in path.read_text()
+
+
+def test_without_imitation_the_oracle_plays_nothing(cluster, tasks, tmp_path):
+    train(cluster, tasks, tmp_path / "run", imitation__steps=0, grpo__steps=0, evaluation__samples=1)
+    assert not (tmp_path / "run" / ORACLE_EPISODES).exists()
 
 
 def test_language_models_are_refused(tasks):

@@ -64,8 +64,8 @@ class PlanOutcome:
     ``reward`` is None if the infrastructure lost the rollout, which says nothing about the plan. ``outcome`` is None for text
     that can't be parsed: it is scored here and never executed, and ``problem`` gives the reason.
 
-    The text of an episode has its answers, and there is no ``outcome``: ``played`` has its steps, failed ones included, and
-    ``cost`` what they cost.
+    The text of an episode has its answers, and ``outcome`` is only that of a lost one: ``played`` has its steps, failed ones
+    included, and ``cost`` what they cost.
     """
 
     text: str
@@ -184,7 +184,8 @@ class _PendingGroup:
 
 
 class Gateway:
-    """Context manager over one run of the cluster. Call ``submit`` from any thread, all other methods from the trainer's.
+    """Context manager over one run of the cluster. Call ``submit`` and ``run`` from any thread, and all other methods
+    from the trainer's.
 
     ``terms`` set the policy for groups that lost a rollout, and the reward's coefficients. ``on_submit`` gets every batch that
     has rollouts, on the gateway's thread.

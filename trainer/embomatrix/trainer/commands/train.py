@@ -216,6 +216,11 @@ def imitate(
             "track": track,
         }
         start = _start(dataset, out, model, settings_file, changes, resume=resume)
+        if start.settings.episodes.visibility is not None:
+            raise TrainerError(
+                "`imitate` learns whole plans, and oracle episodes need a cluster: pass episodes.visibility to "
+                "`embomatrix train`, with --steps 0 for imitation alone"
+            )
         _show_limits(start)
         _show_imitation(_imitated(start, out), out)
 

@@ -19,6 +19,11 @@ from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
 
+def is_named(folder: Path) -> bool:
+    """Return True if a folder is none, but the name of a dataset that ships."""
+    return str(folder) in NAMED and not folder.exists()
+
+
 @dataclass(frozen=True, slots=True)
 class TrainingTask:
     """Task with the content of its prompt, the digest of its bundle, and the oracle plan."""
@@ -47,7 +52,7 @@ def load_tasks(folder: Path) -> TaskSet:
     """Load a dataset folder, or a shipped one by its name. Raises TrainerError if it is missing or damaged."""
     kinds = KindTable()
     try:
-        dataset = dataset_named(str(folder) if str(folder) in NAMED else folder)
+        dataset = dataset_named(str(folder) if is_named(folder) else folder)
     except (DatasetError, OSError) as error:
         raise TrainerError(str(error)) from error
     tasks = read_tasks(dataset, kinds.add)

@@ -9,17 +9,19 @@ import asyncio
 import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.rpc.status import ClusterError
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
+from embomatrix.skills.episode_text import FORMAT
 from embomatrix.skills.parse import DONE
 from embomatrix.skills.prompt import Prompt, plan_in_names
-from embomatrix.trainer.cluster.gateway import result_of
+from embomatrix.trainer.cluster.gateway import PlanOutcome, refuse_without_workers, result_of
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.episodes.players import ClusterEpisode, EpisodePlayers, EpisodeStart
-from embomatrix.trainer.policy.protocol import Example
+from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, PlannedEpisode
+from embomatrix.trainer.policy.protocol import ImitationExample
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
 
@@ -33,6 +35,8 @@ ORACLE_EPISODES: Final = "oracle_episodes.json"
 _REPORT_S: Final = 0.5
 _SCENES: Final = 4
 """Scenes whose episodes are played at a time: with more, workers would load them again and again."""
+_ATTEMPTS: Final = 2
+"""Times that an episode is played at most, if the infrastructure loses it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,111 +46,143 @@ class OracleEpisode:
     opening: str
     turns: tuple[tuple[str, str], ...]
 
-    def example(self, policy: TinyPolicy) -> Example:
+    def example(self, policy: TinyPolicy) -> ImitationExample:
         """Return the episode's tokens. What the policy is told is not imitated."""
         tokens: list[int] = []
         told: list[bool] = []
-        for answer, observation in self.turns:
+        for number, (answer, observation) in enumerate(self.turns, start=1):
             own = policy.encode_plan("" if answer == DONE else answer)
-            after = policy.encode_told(observation)
+            after = policy.encode_told(observation) if number < len(self.turns) else ()
             tokens += (*own, *after)
             told += [False] * len(own) + [True] * len(after)
-        last = len(policy.encode_told(self.turns[-1][1]))
-        end = len(tokens) - last
-        return Example(policy.encode(Prompt("", self.opening)), tuple(tokens[:end]), tuple(told[:end]))
+        return ImitationExample(policy.encode(Prompt("", self.opening)), tuple(tokens), tuple(told))
 
 
 class OracleExamples:
-    """Examples for imitation from oracle episodes, those of ``tasks`` that have one."""
+    """Examples for imitation from oracle episodes: those of ``tasks`` that have one which fits the policy's context."""
 
     def __init__(
         self, episodes: Mapping[str, OracleEpisode], policy: TinyPolicy, tasks: Sequence[TrainingTask]
     ) -> None:
-        self._examples = {name: episode.example(policy) for name, episode in episodes.items()}
+        """Raises TrainerError if no task has one."""
+        examples = {name: episode.example(policy) for name, episode in episodes.items()}
+        self._examples = {
+            name: each
+            for name, each in examples.items()
+            if len(each.prompt) + len(each.plan) <= policy.context
+        }
         self.tasks = tuple(task for task in tasks if task.task.task_id in self._examples)
+        if not self.tasks:
+            raise TrainerError(
+                f"none of {len(tasks)} training tasks has an oracle episode of at most {policy.context} words to imitate: pass "
+                "--imitate-steps 0"
+            )
 
-    def example(self, task: TrainingTask, rng: np.random.Generator) -> Example:
+    def example(self, task: TrainingTask, rng: np.random.Generator) -> ImitationExample:
         """Return the task's episode. Episodes are not varied."""
         return self._examples[task.task.task_id]
 
-    def plain_example(self, task: TrainingTask) -> Example:
+    def plain_example(self, task: TrainingTask) -> ImitationExample:
         """Return the task's episode."""
         return self._examples[task.task.task_id]
 
 
+@dataclass(slots=True)
+class _Progress:
+    """Episodes so far: the successful ones by task, and the outcomes of all."""
+
+    found: dict[str, OracleEpisode] = field(default_factory=dict)
+    outcomes: list[PlanOutcome] = field(default_factory=list)
+
+
 def oracle_episodes(
     folder: Path,
-    starts: Sequence[EpisodeStart],
-    players: EpisodePlayers,
+    identity: Mapping[str, object],
+    planned: Sequence[PlannedEpisode],
+    client: EpisodeClient,
     report: Callable[[int, int], None],
 ) -> dict[str, OracleEpisode]:
-    """Return the oracle's episodes by task: those in ``folder``, or new ones, which are kept there.
+    """Return the oracle's successful episodes by task: those in ``folder``, or new ones, which are kept there.
 
-    Episodes without success, and those that were lost, are left out. ``report`` gets finished and all episodes. Raises
-    TrainerError if the cluster fails or no episode succeeds.
+    ``identity`` says what the episodes depend on; kept ones with another are played again. ``report`` gets finished and all
+    episodes. Raises TrainerError if the cluster fails, no worker is there, or no episode succeeds.
     """
     path = folder / ORACLE_EPISODES
+    version = {**identity, "format": FORMAT}
     if path.exists():
-        return read_episodes(path)
-    priors = PlacePriors([start.task.situation for start in starts])
-    by_scene: dict[str, list[EpisodeStart]] = {}
-    for start in starts:
-        by_scene.setdefault(start.task.bundle_digest, []).append(start)
-    found: dict[str, OracleEpisode] = {}
-    finished = 0
-
-    async def play_scene(own: Sequence[EpisodeStart], gate: asyncio.Semaphore) -> None:
-        nonlocal finished
-        async with gate:
-            for played in asyncio.as_completed([_play(start, players, priors) for start in own]):
-                task_id, episode = await played
-                if episode is not None:
-                    found[task_id] = episode
-                finished += 1
-
-    async def play_all() -> None:
-        gate = asyncio.Semaphore(_SCENES)
-        async with asyncio.TaskGroup() as group:
-            for own in by_scene.values():
-                group.create_task(play_scene(own, gate))
-
-    playing = players.run(play_all())
-    while not playing.done():
-        report(finished, len(starts))
-        wait([playing], timeout=_REPORT_S)
-    result_of(playing)
-    report(finished, len(starts))
-    if not found:
+        kept_version, kept = read_episodes(path)
+        if kept_version == version:
+            return kept
+    progress = _Progress()
+    playing = client.run(_play_all(planned, client, progress))
+    while not wait([playing], timeout=_REPORT_S).done:
+        report(len(progress.outcomes), len(planned))
+    try:
+        result_of(playing)
+    except ExceptionGroup as errors:
+        if (found := errors.subgroup(ClusterError)) is None:
+            raise
+        raise TrainerError(str(_first(found))) from errors
+    report(len(planned), len(planned))
+    refuse_without_workers(progress.outcomes, "the oracle's episodes")
+    if not progress.found:
         raise TrainerError(
-            f"the oracle succeeds in none of {len(starts)} training tasks: check the dataset with `embomatrix eval "
+            f"the oracle succeeds in none of {len(planned)} training tasks: check the dataset with `embomatrix eval "
             "--interactive --baseline oracle`"
         )
-    in_order = {start.task.task.task_id: found.get(start.task.task.task_id) for start in starts}
-    kept = {task_id: episode for task_id, episode in in_order.items() if episode is not None}
+    in_order = [each.task.task.task_id for each in planned]
+    kept = {task_id: progress.found[task_id] for task_id in in_order if task_id in progress.found}
     rows = {task_id: [episode.opening, *episode.turns] for task_id, episode in kept.items()}
-    write_whole(path, json.dumps(rows).encode("utf-8"))
+    write_whole(path, json.dumps({"version": version, "episodes": rows}).encode("utf-8"))
     return kept
 
 
+def _first(errors: BaseExceptionGroup[BaseException]) -> BaseException:
+    first = errors.exceptions[0]
+    return _first(first) if isinstance(first, BaseExceptionGroup) else first
+
+
+async def _play_all(planned: Sequence[PlannedEpisode], client: EpisodeClient, progress: _Progress) -> None:
+    """Play all episodes, those of few scenes at a time. Ends early if no worker takes those of a scene."""
+    priors = PlacePriors([each.task.situation for each in planned])
+    by_scene: dict[str, list[PlannedEpisode]] = {}
+    for each in planned:
+        by_scene.setdefault(each.task.bundle_digest, []).append(each)
+    gate = asyncio.Semaphore(_SCENES)
+
+    async def play_scene(own: Sequence[PlannedEpisode]) -> None:
+        async with gate:
+            async with asyncio.TaskGroup() as group:
+                playing = [group.create_task(_play(each, client, priors, progress)) for each in own]
+            refuse_without_workers([each.result() for each in playing], "the oracle's episodes")
+
+    async with asyncio.TaskGroup() as group:
+        for own in by_scene.values():
+            group.create_task(play_scene(own))
+
+
 async def _play(
-    start: EpisodeStart, players: EpisodePlayers, priors: PlacePriors
-) -> tuple[str, OracleEpisode | None]:
-    """Play the oracle's episode of a task, None without success."""
-    task = start.task
-    [episode] = await players.begin_all([start])
-    script = SearchingScript.of(task.oracle, task.situation, priors)
-    turns: list[tuple[str, str]] = []
-    while not episode.is_over:
-        answer = _answer(script, episode, start)
-        turns.append((answer, await episode.answer(answer)))
-    succeeded = episode.lost is None and episode.player.reward.tiers.success
-    opening = episode.opening
-    if not succeeded or opening is None:
-        return task.task.task_id, None
-    return task.task.task_id, OracleEpisode(opening.user, tuple(turns))
+    planned: PlannedEpisode, client: EpisodeClient, priors: PlacePriors, progress: _Progress
+) -> PlanOutcome:
+    """Play the oracle's episode of a task, and keep it if it succeeds."""
+    task = planned.task
+    for _ in range(_ATTEMPTS):
+        [episode] = await client.begin_all([planned])
+        script = SearchingScript.of(task.oracle, task.situation, priors)
+        turns: list[tuple[str, str]] = []
+        while not episode.is_over:
+            answer = _answer(script, episode)
+            turns.append((answer, await episode.answer(answer)))
+        if episode.lost is None:
+            break
+    outcome = episode.outcome()
+    if outcome.success and episode.opening is not None:
+        progress.found[task.task.task_id] = OracleEpisode(episode.opening.user, tuple(turns))
+    progress.outcomes.append(outcome)
+    return outcome
 
 
-def _answer(script: SearchingScript, episode: ClusterEpisode, start: EpisodeStart) -> str:
+def _answer(script: SearchingScript, episode: ClusterEpisode) -> str:
     """Return the script's next call in the policy's words."""
     known = episode.player.observer.situation
     steps = episode.player.steps
@@ -154,15 +190,16 @@ def _answer(script: SearchingScript, episode: ClusterEpisode, start: EpisodeStar
     return DONE if call is None else plan_in_names((call,), known)
 
 
-def read_episodes(path: Path) -> dict[str, OracleEpisode]:
-    """Read kept episodes by task. Raises TrainerError if the file is damaged."""
+def read_episodes(path: Path) -> tuple[dict[str, object], dict[str, OracleEpisode]]:
+    """Read kept episodes: what they depend on, and the episodes by task. Raises TrainerError if the file is damaged."""
     try:
-        rows = parse_json(path.read_bytes())
-        return {
+        value = parse_json(path.read_bytes())
+        episodes = {
             str(task_id): OracleEpisode(str(opening), tuple((str(a), str(b)) for a, b in turns))
-            for task_id, (opening, *turns) in rows.items()
+            for task_id, (opening, *turns) in value["episodes"].items()
         }
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+        return dict(value["version"]), episodes
+    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
         raise TrainerError(
             f"{path} is damaged ({error}): remove it, and the episodes are played again"
         ) from error

@@ -67,7 +67,8 @@ class EpisodeSubject(Protocol):
     ) -> Said:
         """Return the next answer.
 
-        ``told`` are the texts so far, the task first, and ``said`` the answers to them. A model must not look at the player.
+        ``told`` are the texts so far, the task first, and ``said`` the answers to them. A model must not look at the player,
+        but stops it if it has no room for another answer; then what it returns does not count.
         """
         ...
 
@@ -166,11 +167,15 @@ def play_episodes(
         said: list[Said] = []
         told = [prompt.user]
         while player.end is None:
-            said.append(await subject.answer(prompt.system, told, [one.text for one in said], player))
+            answer = await subject.answer(prompt.system, told, [one.text for one in said], player)
+            if player.end is not None:  # the subject has no room for another answer
+                break
+            said.append(answer)
             told.append((await player.answer(said[-1].text)).text)
         text = json.dumps([one.text for one in said])
         tokens = (sum(one.prompt_tokens for one in said), sum(one.completion_tokens for one in said))
-        sheet.add([Answer(task_id, sample, text, said[-1].finish, *tokens)])
+        finish = said[-1].finish if said else ""
+        sheet.add([Answer(task_id, sample, text, finish, *tokens)])
         on_progress(len(sheet), total)
 
     try:

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from embomatrix.skills.parse import DONE
 from embomatrix.trainer.cluster.gateway import refuse_without_workers
-from embomatrix.trainer.episodes.games import Game, PlayedGame, play_games
-from embomatrix.trainer.episodes.players import ClusterEpisode, EpisodePlayers, EpisodeStart
+from embomatrix.trainer.episodes.batches import EpisodeBatch, PlayedBatch, play_batches
+from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, PlannedEpisode
 from embomatrix.trainer.evaluation.episodes import episode_verdict
 from embomatrix.trainer.evaluation.held_out import HeldOutAnswer, HeldOutEvaluation, task_score
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
@@ -22,57 +21,57 @@ if TYPE_CHECKING:
     from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
     from embomatrix.trainer.policy.protocol import Policy
 
-_AT_A_TIME = 4
-"""Games between two reports of the progress."""
+_EACH = 2
+"""Batches that each learner plays between two reports of the progress."""
 
 
 def evaluate_in_episodes(
     workers: DataParallelWorkers,
     policy: Policy,
-    starts: Sequence[EpisodeStart],
-    players: EpisodePlayers,
+    planned: Sequence[PlannedEpisode],
+    client: EpisodeClient,
     rule: SamplingRule,
     *,
     chunk: int,
     seed: int,
     report: Callable[[int, int], None],
 ) -> HeldOutEvaluation:
-    """Play ``rule.group`` episodes of each start. ``report`` gets finished and total tasks.
+    """Play ``rule.group`` episodes of each planned one. ``report`` gets finished and total tasks.
 
-    A chunk of tasks is one game with its own seed. Raises TrainerError if the cluster failed, or no worker took any turn.
+    ``chunk`` tasks are a batch with a seed of its own. Raises TrainerError if the cluster failed, or no worker took any turn.
     """
-    parts = [starts[at : at + chunk] for at in range(0, len(starts), chunk)]
-    games = [Game(index, part, _seed_of(seed, index)) for index, part in enumerate(parts)]
-    played: list[PlayedGame] = []
-    done = 0
-    report(0, len(starts))
-    for at in range(0, len(games), _AT_A_TIME):
-        batch = games[at : at + _AT_A_TIME]
-        played += play_games(batch, workers, players, policy, rule)
-        done += sum(len(game.starts) for game in batch)
-        report(done, len(starts))
-    outcomes = [each for game in played for of_task in game.outcomes() for each in of_task]
-    refuse_without_workers(outcomes, f"the evaluation on {len(starts)} tasks")
-    scores, answers = [], []
-    for game in played:
-        for number, (start, own) in enumerate(zip(game.game.starts, game.outcomes(), strict=True)):
-            scores.append(task_score(start.task, own))
-            episodes = game.episodes[number * rule.group : (number + 1) * rule.group]
-            answers += [
-                _answer(start.task, sample, outcome.text, episode)
-                for sample, (outcome, episode) in enumerate(zip(own, episodes, strict=True))
-            ]
+    parts = [planned[at : at + chunk] for at in range(0, len(planned), chunk)]
+    batches = [EpisodeBatch(index, part, _seed_of(seed, index)) for index, part in enumerate(parts)]
+    size = _EACH * workers.count
+    found = HeldOutEvaluation(())
+    report(0, len(planned))
+    for at in range(0, len(batches), size):
+        played = play_batches(batches[at : at + size], workers, client, policy, rule)
+        outcomes = [each for batch in played for of_task in batch.outcomes() for each in of_task]
+        refuse_without_workers(outcomes, f"the evaluation on {len(planned)} tasks")
+        for batch in played:
+            found = _with_batch(found, batch)
+        report(len(found.scores), len(planned))
+    return found
+
+
+def _with_batch(found: HeldOutEvaluation, played: PlayedBatch) -> HeldOutEvaluation:
+    scores, answers = [*found.scores], [*found.answers]
+    for number, (planned, outcomes) in enumerate(zip(played.batch.planned, played.outcomes(), strict=True)):
+        scores.append(task_score(planned.task, outcomes))
+        answers += [
+            _answer(planned.task, sample, episode) for sample, episode in enumerate(played.of_task(number))
+        ]
     return HeldOutEvaluation(tuple(scores), tuple(answers))
 
 
-def _seed_of(seed: int, chunk: int) -> int:
-    return int(np.random.SeedSequence((seed, chunk)).generate_state(1)[0])
+def _seed_of(seed: int, batch: int) -> int:
+    return int(np.random.SeedSequence((seed, batch)).generate_state(1)[0])
 
 
-def _answer(task: TrainingTask, sample: int, text: str, episode: ClusterEpisode) -> HeldOutAnswer:
+def _answer(task: TrainingTask, sample: int, episode: ClusterEpisode) -> HeldOutAnswer:
     plan = tuple(step.call for step in episode.player.steps if step.ok)
-    answers = json.dumps([answer or DONE for answer in text.split("\n")])
-    return HeldOutAnswer(answers, _verdict(task, sample, episode), plan)
+    return HeldOutAnswer(json.dumps(episode.answers), _verdict(task, sample, episode), plan)
 
 
 def _verdict(task: TrainingTask, sample: int, episode: ClusterEpisode) -> AnswerVerdict:

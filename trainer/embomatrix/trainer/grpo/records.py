@@ -51,7 +51,10 @@ class StepRecord:
     """Share of the rollouts that ``grpo.max_new`` cut off before their end token."""
     warm: float | None
     shared: float | None
-    """Share of the steps that were known from equal plans or equal beginnings and not executed. Both are None in episodes."""
+    """Share of the steps that were known from equal plans or equal beginnings and not executed.
+
+    Both are None in episodes, and if no plan was executed.
+    """
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,8 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.gateway import PlanGroup, PlanOutcome, PlanSubmitter, result_of
 from embomatrix.trainer.config.settings import GrpoSettings, Overlong
 from embomatrix.trainer.data.tasks import TrainingTask
-from embomatrix.trainer.episodes.games import Game, PlayedGame, play_games
-from embomatrix.trainer.episodes.players import EpisodePlayers, EpisodeStart
+from embomatrix.trainer.episodes.batches import EpisodeBatch, PlayedBatch, play_batches
+from embomatrix.trainer.episodes.client import EpisodeClient, PlannedEpisode
 from embomatrix.trainer.learning.learner import SamplingRule
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
@@ -195,43 +195,35 @@ class EpisodeSampler(Sampler):
     ) -> None:
         super().__init__(workers, policy.codec, prompt_builder, gateway, settings)
         self._policy = policy
-        self._players = EpisodePlayers(gateway, terms, policy.codec)
-        self._terms = terms
+        self._client = EpisodeClient(gateway, terms, policy.codec)
 
     def _chunks(
         self, step: int, parts: Sequence[_Part], rng: np.random.Generator, seed_of: Callable[[str], int]
     ) -> list[SampledChunk]:
-        games = [
-            Game(
+        batches = [
+            EpisodeBatch(
                 part.index,
-                [
-                    EpisodeStart(
-                        task,
-                        self._prompt_builder.told(task, seen=self._terms.sight),
-                        seed_of(task.task.task_id),
-                    )
-                    for task in part.tasks
-                ],
+                [PlannedEpisode(task, seed_of(task.task.task_id)) for task in part.tasks],
                 part.seed,
             )
             for part in parts
         ]
         rule = SamplingRule.of(self._settings)
-        played = play_games(games, self._workers, self._players, self._policy, rule)
-        return [_chunk_of(each, here=self._workers.remote(each.game.index) is None) for each in played]
+        played = play_batches(batches, self._workers, self._client, self._policy, rule)
+        return [_chunk_of(each, here=self._workers.remote(each.batch.index) is None) for each in played]
 
 
-def _chunk_of(played: PlayedGame, *, here: bool) -> SampledChunk:
-    starts = played.game.starts
+def _chunk_of(played: PlayedBatch, *, here: bool) -> SampledChunk:
+    tasks = [planned.task for planned in played.batch.planned]
     futures = []
     for outcomes in played.outcomes():
         future: Future[tuple[PlanOutcome, ...]] = Future()
         future.set_result(outcomes)
         futures.append(future)
     return SampledChunk(
-        played.game.index,
-        [start.task for start in starts],
-        [TaskPrompt(start.situation, tokens) for start, tokens in zip(starts, played.prompts, strict=True)],
+        played.batch.index,
+        tasks,
+        [TaskPrompt(task.situation, tokens) for task, tokens in zip(tasks, played.prompts, strict=True)],
         played.samples,
         played.samples.mask,
         futures,

@@ -31,7 +31,7 @@ from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingRul
 from embomatrix.trainer.learning.objective import LossMetrics
 from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
 from embomatrix.trainer.policy.loading import saved_policy
-from embomatrix.trainer.policy.protocol import Example, Policy, Samples, Tokens
+from embomatrix.trainer.policy.protocol import ImitationExample, Policy, Samples, Tokens
 
 T = TypeVar("T")
 _ALIGNMENT_BYTES: Final = 64
@@ -83,7 +83,8 @@ class RemoteLearner:
         self.closed = False
 
     def run(self, job: Callable[[RemoteLearner], T]) -> Future[T]:
-        """Queue ``job`` on this learner's thread. The job must not wait for other jobs, or Ctrl-C would wait too."""
+        """Queue ``job`` on this learner's thread. The job must not wait for other jobs, nor longer than a second for anything
+        once this learner is closed, or Ctrl-C would wait too."""
         return self._thread.submit(job, self)
 
     def use_reference(self, folder: Path) -> None:
@@ -94,15 +95,15 @@ class RemoteLearner:
         samples: Samples = self._request("sample", tuple(prompts), seed, rule)
         return samples
 
-    def converse(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
-        self._request("converse", number, tuple(prompts), seed, rule)
+    def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
+        self._request("begin_episodes", number, tuple(prompts), seed, rule)
 
-    def reply(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
-        answers: list[str | None] = self._request("reply", number, tuple(rows), tuple(told))
+    def answer_episodes(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
+        answers: list[str | None] = self._request("answer_episodes", number, tuple(rows), tuple(told))
         return answers
 
-    def end_conversation(self, number: int) -> Samples:
-        samples: Samples = self._request("end_conversation", number)
+    def end_episodes(self, number: int) -> Samples:
+        samples: Samples = self._request("end_episodes", number)
         return samples
 
     def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
@@ -118,7 +119,7 @@ class RemoteLearner:
         metrics, has_gradient = self._request("learn", microbatch)
         return metrics, self._gradients(has_gradient)
 
-    def imitate(self, examples: Sequence[Example], tokens: int) -> tuple[float, list[Tensor | None]]:
+    def imitate(self, examples: Sequence[ImitationExample], tokens: int) -> tuple[float, list[Tensor | None]]:
         """Return the loss of the examples, and its gradient by parameter."""
         loss, has_gradient = self._request("imitate", tuple(examples), tokens)
         return loss, self._gradients(has_gradient)
@@ -167,9 +168,9 @@ class _Requests:
         self._settings = settings
         self._learner = Learner(policy, None, settings.grpo)
         self.sample = self._learner.sample
-        self.converse = self._learner.converse
-        self.reply = self._learner.reply
-        self.end_conversation = self._learner.end_conversation
+        self.begin_episodes = self._learner.begin_episodes
+        self.answer_episodes = self._learner.answer_episodes
+        self.end_episodes = self._learner.end_episodes
         self.current_logprobs = self._learner.current_logprobs
         self.reference_logprobs = self._learner.reference_logprobs
 
@@ -179,7 +180,7 @@ class _Requests:
     def learn(self, microbatch: Microbatch) -> tuple[LossMetrics, list[bool]]:
         return self._with_gradient(functools.partial(self._learner.learn, microbatch))
 
-    def imitate(self, examples: Sequence[Example], tokens: int) -> tuple[float, list[bool]]:
+    def imitate(self, examples: Sequence[ImitationExample], tokens: int) -> tuple[float, list[bool]]:
         return self._with_gradient(functools.partial(self._learner.imitate, examples, tokens))
 
     def _with_gradient(self, job: Callable[[], T]) -> tuple[T, list[bool]]:
@@ -259,6 +260,11 @@ class DataParallelWorkers:
             finally:
                 for remote in remotes:
                     remote.close()
+
+    @property
+    def count(self) -> int:
+        """Number of learners."""
+        return 1 + len(self._remotes)
 
     @property
     def has_remotes(self) -> bool:

@@ -10,7 +10,7 @@ from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, Remot
 from embomatrix.trainer.learning.learner import Learner, Microbatch
 from embomatrix.trainer.learning.likelihood import plan_tokens
 from embomatrix.trainer.learning.objective import LossMetrics
-from embomatrix.trainer.policy.protocol import Example, Policy
+from embomatrix.trainer.policy.protocol import ImitationExample, Policy
 
 T = TypeVar("T")
 Gradient = Sequence[Tensor | None]
@@ -42,7 +42,7 @@ class GradientSum:
             return learner.learn(microbatch)
         return self._separately(functools.partial(learner.learn, microbatch))
 
-    def imitate(self, batch: Sequence[Example], size: int) -> float:
+    def imitate(self, batch: Sequence[ImitationExample], size: int) -> float:
         """Replace the sum by the gradient of the mean loss per plan token of a batch, and return this loss.
 
         The batch is back-propagated in microbatches of ``size`` examples.
@@ -58,7 +58,7 @@ class GradientSum:
         return total
 
     def _imitate(
-        self, examples: Sequence[Example], tokens: int, learner: Learner | RemoteLearner
+        self, examples: Sequence[ImitationExample], tokens: int, learner: Learner | RemoteLearner
     ) -> tuple[float, Gradient | None]:
         if isinstance(learner, RemoteLearner):
             return learner.imitate(examples, tokens)

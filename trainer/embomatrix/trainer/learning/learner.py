@@ -11,8 +11,8 @@ from torch import Tensor
 from embomatrix.trainer.config.settings import GrpoSettings
 from embomatrix.trainer.learning.likelihood import negative_log_likelihood
 from embomatrix.trainer.learning.objective import LossInputs, LossMetrics, LossTotals, surrogate_loss
-from embomatrix.trainer.policy.conversation import Conversation
-from embomatrix.trainer.policy.protocol import Example, Policy, Samples, Tokens
+from embomatrix.trainer.policy.episode_rows import EpisodeRows
+from embomatrix.trainer.policy.protocol import ImitationExample, Policy, Samples, Tokens
 from embomatrix.trainer.policy.tiny import TinyPolicy
 
 
@@ -55,7 +55,7 @@ class Learner:
         self.policy = policy
         self.reference = reference
         self._settings = settings
-        self._conversations: dict[int, Conversation] = {}
+        self._episodes: dict[int, EpisodeRows] = {}
 
     def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
         """Draw plans for each prompt with a generator of this seed."""
@@ -63,27 +63,25 @@ class Learner:
         generator = torch.Generator(device).manual_seed(seed)
         return self.policy.sample(prompts, rule.group, rule.temperature, rule.max_new, generator)
 
-    def converse(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
-        """Begin the conversation of this number, with ``rule.group`` episodes for each prompt."""
+    def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
+        """Begin the batch of episodes of this number, with ``rule.group`` for each prompt."""
         assert isinstance(self.policy, TinyPolicy), "the settings refuse other policies"
         generator = torch.Generator(self.policy.device).manual_seed(seed)
-        self._conversations[number] = Conversation(
-            self.policy, prompts, rule.group, rule.temperature, generator
-        )
+        self._episodes[number] = EpisodeRows(self.policy, prompts, rule.group, rule.temperature, generator)
 
-    def reply(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
-        """Tell episodes of a conversation what happened, unless they begin, and sample their answers.
+    def answer_episodes(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
+        """Tell episodes of a batch what happened, unless they begin, and sample their answers.
 
         An answer is None if the policy has no room for another one.
         """
-        conversation = self._conversations[number]
+        episodes = self._episodes[number]
         if told:
-            conversation.tell(rows, told)
-        return conversation.answer(rows)
+            episodes.tell(rows, told)
+        return episodes.answer(rows)
 
-    def end_conversation(self, number: int) -> Samples:
-        """Return all episodes of a conversation as samples, and forget it."""
-        return self._conversations.pop(number).samples()
+    def end_episodes(self, number: int) -> Samples:
+        """Return all episodes of a batch as samples, and forget it."""
+        return self._episodes.pop(number).samples()
 
     @torch.no_grad()
     def current_logprobs(self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor) -> Tensor:
@@ -98,7 +96,7 @@ class Learner:
         assert reference is not None, "GRPO begins with a reference policy"
         return reference.logprobs(prompts, tokens, mask, settings.group, settings.temperature).logprobs
 
-    def imitate(self, examples: Sequence[Example], tokens: int) -> float:
+    def imitate(self, examples: Sequence[ImitationExample], tokens: int) -> float:
         """Add the gradient of the examples' loss to the gradients of the policy's parameters, and return the loss.
 
         ``tokens`` is the denominator: the plan tokens of the whole batch.

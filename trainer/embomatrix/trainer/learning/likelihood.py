@@ -6,15 +6,15 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from embomatrix.trainer.policy.protocol import Example, Policy
+from embomatrix.trainer.policy.protocol import ImitationExample, Policy
 
 
-def plan_tokens(examples: Sequence[Example]) -> int:
+def plan_tokens(examples: Sequence[ImitationExample]) -> int:
     """Return the number of tokens in the examples that a policy writes."""
     return sum(example.own for example in examples)
 
 
-def negative_log_likelihood(policy: Policy, examples: Sequence[Example]) -> Tensor:
+def negative_log_likelihood(policy: Policy, examples: Sequence[ImitationExample]) -> Tensor:
     """Return the negative log-likelihood of the plans in nats, summed over the tokens that a policy writes."""
     prompts, plans, _ = zip(*examples, strict=True)
     tokens = pad_sequence([torch.tensor(plan) for plan in plans], batch_first=True)
@@ -24,5 +24,5 @@ def negative_log_likelihood(policy: Policy, examples: Sequence[Example]) -> Tens
     return -scored.logprobs.sum()
 
 
-def _own(example: Example) -> Tensor:
+def _own(example: ImitationExample) -> Tensor:
     return ~torch.tensor(example.told or (False,) * len(example.plan), dtype=torch.bool)

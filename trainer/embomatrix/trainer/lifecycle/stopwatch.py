@@ -55,7 +55,7 @@ class Stopwatch:
             raise
 
     def move(self, seconds: float, source: Activity, target: Activity) -> None:
-        """Count seconds of one activity, which were counted already, as those of another."""
+        """Count seconds of one activity as those of another. The block of the former may still run."""
         for activity, change in ((source, -seconds), (target, seconds)):
             self.spent_s[activity.value] = self.spent_s.get(activity.value, 0.0) + change
 

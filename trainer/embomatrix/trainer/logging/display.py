@@ -48,6 +48,9 @@ class LineDisplay:
     def playing_oracle(self, done: int, total: int) -> None:
         self._show("oracle episodes", done / total, {"episodes": f"{done} of {total}"})
 
+    def played_oracle(self, count: int, total: int) -> None:
+        self._print(f"{count} of {total} training tasks have an episode of the oracle to imitate")
+
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._clock.note_evaluation(label, done, total, time.monotonic())
         self._show(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})

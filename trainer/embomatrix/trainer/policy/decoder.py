@@ -339,7 +339,7 @@ class Decoder(nn.Module):
         rope = self._rope(begin + torch.arange(length, device=tokens.device))
         absent = _joined_gaps(plan, tokens, gaps)
         visible = _visible(prompt, plan, length, absent, group) if length > 1 else None
-        last = _last_tokens(plan) if plan else prompt.tokens[:, -1].repeat_interleave(group)
+        last = _last_tokens(prompt.tokens[:, -1].repeat_interleave(group), plan)
         x = self._embed(self.embedding(tokens), self.embedding(last)[:, None])
         caches = []
         for index, (block, prompt_cache) in enumerate(zip(self.blocks, prompt.layers, strict=True)):
@@ -374,12 +374,14 @@ def _joined_gaps(plan: PlanCache | None, tokens: Tensor, gaps: Tensor | None) ->
     return torch.cat([before, gaps], dim=1)
 
 
-def _last_tokens(plan: PlanCache) -> Tensor:
-    """Return the last token of each row (rows,)."""
+def _last_tokens(before: Tensor, plan: PlanCache | None) -> Tensor:
+    """Return the last token of each row (rows,), that ``before`` the plan if it has none."""
+    if plan is None:
+        return before
     if plan.gaps is None:
         return plan.tokens[:, -1]
     at = torch.arange(plan.tokens.shape[1], device=plan.tokens.device).masked_fill(plan.gaps, -1).amax(dim=1)
-    return plan.tokens.gather(1, at[:, None])[:, 0]
+    return torch.where(at >= 0, plan.tokens.gather(1, at.clamp(min=0)[:, None])[:, 0], before)
 
 
 def _visible(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import torch
 
-from embomatrix.skills.episode_text import OBSERVATION_WORDS
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.compute_dtype import torch_dtype
@@ -98,11 +97,8 @@ def word_level_shape(settings: TrainSettings, tasks: TaskSet) -> tuple[Vocabular
         return vocabulary, shape
     situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
     in_episodes = settings.episodes.visibility is not None
-    vocabulary = build_vocabulary(
-        situations,
-        [task.task.instruction for task in tasks.train],
-        OBSERVATION_WORDS if in_episodes else (),
-    )
+    instructions = [task.task.instruction for task in tasks.train]
+    vocabulary = build_vocabulary(situations, instructions, in_episodes=in_episodes)
     shape = DecoderShape(len(vocabulary), **settings.tiny.model_dump())
     return vocabulary, replace(shape, longest=EPISODE_CONTEXT) if in_episodes else shape
 

@@ -10,7 +10,7 @@ from embomatrix.skills.parse import plan_to_json, plan_to_lines
 from embomatrix.skills.prompt import Codec, Situation, limited, plan_in_names, prompt_for, subset
 from embomatrix.skills.syntax import Plan
 from embomatrix.trainer.data.variation import Variation, drop_bystanders, used_rows, vary
-from embomatrix.trainer.policy.protocol import Example
+from embomatrix.trainer.policy.protocol import ImitationExample
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,11 +30,11 @@ class TaskPrompt:
 class Examples(Protocol):
     """Source of the examples of imitation."""
 
-    def example(self, task: TrainingTask, rng: np.random.Generator) -> Example:
+    def example(self, task: TrainingTask, rng: np.random.Generator) -> ImitationExample:
         """Return a task's example, perhaps varied."""
         ...
 
-    def plain_example(self, task: TrainingTask) -> Example:
+    def plain_example(self, task: TrainingTask) -> ImitationExample:
         """Return a task's unvaried example, for the validation loss."""
         ...
 
@@ -61,20 +61,12 @@ class PromptBuilder:
         variation = replace(self.variation, rename=self.practice_rename)
         return self._build(vary(limited(task.situation, self.rows), variation, rng))
 
-    def told(self, task: TrainingTask, *, seen: bool) -> Situation:
-        """Return the situation that an episode's texts tell of: at most ``rows`` rows, or all if what is seen decides."""
-        return task.situation if seen else limited(task.situation, self.rows)
-
-    def told_oracle(self, task: TrainingTask, *, seen: bool) -> Situation:
-        """Return the situation of an oracle episode: also the rows that the oracle plan uses."""
-        return task.situation if seen else self._with_needed(task)
-
-    def example(self, task: TrainingTask, rng: np.random.Generator) -> Example:
+    def example(self, task: TrainingTask, rng: np.random.Generator) -> ImitationExample:
         """Return a randomly varied prompt and the oracle plan, for imitation."""
         situation = drop_bystanders(self._with_needed(task), used_rows(task.oracle), self.variation.drop, rng)
         return self._example(task, vary(situation, self.variation, rng))
 
-    def plain_example(self, task: TrainingTask) -> Example:
+    def plain_example(self, task: TrainingTask) -> ImitationExample:
         """Return the unvaried prompt and the oracle plan, for the validation loss."""
         return self._example(task, self._with_needed(task))
 
@@ -83,9 +75,9 @@ class PromptBuilder:
         kept = {row.index for row in limited(task.situation, self.rows).rows}
         return subset(task.situation, kept | used_rows(task.oracle))
 
-    def _example(self, task: TrainingTask, situation: Situation) -> Example:
+    def _example(self, task: TrainingTask, situation: Situation) -> ImitationExample:
         text = plan_text(task.oracle, situation, self.policy.codec)
-        return Example(self._build(situation).tokens, self.policy.encode_plan(text))
+        return ImitationExample(self._build(situation).tokens, self.policy.encode_plan(text))
 
     def _build(self, situation: Situation) -> TaskPrompt:
         return TaskPrompt(situation, self.policy.encode(prompt_for(situation, self.policy.codec)))

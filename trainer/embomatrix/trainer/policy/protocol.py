@@ -16,7 +16,7 @@ from embomatrix.skills.prompt import Codec, Prompt
 Tokens = tuple[int, ...]
 
 
-class Example(NamedTuple):
+class ImitationExample(NamedTuple):
     """Prompt and plan to imitate. ``told`` is true on tokens of the plan that the policy is told in an episode; empty: none."""
 
     prompt: Tokens

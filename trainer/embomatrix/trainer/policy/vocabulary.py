@@ -12,9 +12,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from embomatrix.skills.prompt import Situation
+from embomatrix.skills.episode_text import OBSERVATION_WORDS
+from embomatrix.skills.prompt import ABSENT, Situation
 from embomatrix.skills.syntax import PROFILES, SIGNATURES, PlaceRelation
 from embomatrix.world.state import State
+from embomatrix.world.substances import WORDS as SUBSTANCE_WORDS
 from embomatrix.world.task import Profile
 
 PAD: Final = 0
@@ -31,6 +33,8 @@ _LONGEST_PHRASE: Final = 4
 _ARGUMENT_COUNTS: Final[Mapping[str, int]] = {
     skill.value: len(arguments) for skill, arguments in SIGNATURES.items()
 }
+_SUBSTANCE_STATES: Final = tuple(f"{words.replace(' ', '_')}_" for words in SUBSTANCE_WORDS.values())
+_WATER: Final = "water"
 _MIN_COUNT: Final = 2
 """Occurrences of a word in the instructions that make it part of the vocabulary."""
 _FIXED_WORDS: Final = (
@@ -44,23 +48,24 @@ _FIXED_WORDS: Final = (
 
 
 def build_vocabulary(
-    situations: Iterable[Situation], instructions: Iterable[str], further: Iterable[str] = ()
+    situations: Iterable[Situation], instructions: Iterable[str], *, in_episodes: bool = False
 ) -> Vocabulary:
     """Build the vocabulary of tasks from the object tables in ``situations`` and the training ``instructions``.
 
-    ``further`` are words of other texts that the policy is told.
+    With ``in_episodes`` it has the words of observations and all rooms of the scenes too.
     """
-    words: dict[str, None] = dict.fromkeys((*_FIXED_WORDS, *further))
+    known = tuple(situations)
+    words: dict[str, None] = dict.fromkeys((*_FIXED_WORDS, *(_told_words(known) if in_episodes else ())))
     object_stems: dict[str, None] = {}
     room_stems: dict[str, None] = {}
     numbers = {0}
-    for situation in situations:
+    for situation in known:
         words |= dict.fromkeys(skill.value for skill in PROFILES[situation.profile])
         words |= dict.fromkeys(state for row in situation.rows for state in row.states)
         object_stems |= dict.fromkeys(row.category for row in situation.rows)
         for stems, names in (
             (object_stems, [row.name for row in situation.rows]),
-            (room_stems, situation.rooms),
+            (room_stems, situation.home if in_episodes else situation.rooms),
         ):
             for name in names:
                 stem, number = _split_number(name)
@@ -74,6 +79,22 @@ def build_vocabulary(
     words |= named
     words |= dict.fromkeys(f"_{number}" for number in range(max(numbers) + 1))
     return Vocabulary((*SPECIAL, *words), tuple(object_stems), tuple(room_stems))
+
+
+def _told_words(situations: Iterable[Situation]) -> tuple[str, ...]:
+    """Return the words of observations, besides those of prompts: of outcomes, and of states that calls may lead to."""
+    words = dict.fromkeys((*OBSERVATION_WORDS, ABSENT))
+    substances = dict.fromkeys((_WATER,))
+    for situation in situations:
+        states = (state for row in situation.rows for state in row.states)
+        substances |= dict.fromkeys(
+            state.removeprefix(start)
+            for state in states
+            for start in _SUBSTANCE_STATES
+            if state.startswith(start)
+        )
+    words |= dict.fromkeys(f"{start}{name}" for start in _SUBSTANCE_STATES for name in substances)
+    return tuple(words)
 
 
 def _split_number(name: str) -> tuple[str, str]:

@@ -18,8 +18,8 @@ from embomatrix.skills.seeds import evaluation_seed, training_seed
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.settings import SeedPer
 from embomatrix.trainer.data.tasks import Curriculum, Schedule
+from embomatrix.trainer.episodes.client import EpisodeClient, PlannedEpisode
 from embomatrix.trainer.episodes.oracle import OracleExamples, oracle_episodes
-from embomatrix.trainer.episodes.players import EpisodePlayers, EpisodeStart
 from embomatrix.trainer.episodes.terms import EpisodeTerms
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.evaluation.held_out_episodes import evaluate_in_episodes
@@ -122,21 +122,30 @@ class TrainingRun:
     def _oracle_examples(self) -> OracleExamples | None:
         """Play or read the oracle's episodes, if the policy plays episodes and shall imitate."""
         start, terms, policy = self._start, self._terms, self._start.policy
-        settings = self._settings.imitation
-        if terms is None or not isinstance(policy, TinyPolicy) or (settings.steps or settings.seconds) == 0:
+        budget = self._settings.imitation
+        has_budget = budget.seconds > 0 if budget.steps is None else budget.steps > 0
+        if (
+            terms is None
+            or not isinstance(policy, TinyPolicy)
+            or not has_budget
+            or self._progress.imitation.done
+        ):
             return None
-        starts = [
-            EpisodeStart(
-                task,
-                start.prompt_builder.told_oracle(task, seen=terms.sight),
-                training_seed(self._settings.seed, task.task.task_id, 0),
-            )
+        planned = [
+            PlannedEpisode(task, training_seed(self._settings.seed, task.task.task_id, 0))
             for task in start.tasks.train
             if task.oracle
         ]
-        players = EpisodePlayers(self._gateway, terms, policy.codec)
-        episodes = oracle_episodes(self._out, starts, players, self._display.playing_oracle)
-        return OracleExamples(episodes, policy, start.tasks.train)
+        identity = {
+            "dataset": self._progress.dataset,
+            "seed": self._settings.seed,
+            "episodes": self._settings.episodes.model_dump(mode="json"),
+        }
+        client = EpisodeClient(self._gateway, terms, policy.codec)
+        episodes = oracle_episodes(self._out, identity, planned, client, self._display.playing_oracle)
+        examples = OracleExamples(episodes, policy, start.tasks.train)
+        self._display.played_oracle(len(examples.tasks), len(planned))
+        return examples
 
     def _load_tensors(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])
@@ -194,19 +203,12 @@ class TrainingRun:
     ) -> HeldOutEvaluation:
         start, settings, seed = self._start, self._settings.evaluation, self._settings.seed
         self._gateway.announce({0: start.evaluated}, samples)
-        starts = [
-            EpisodeStart(
-                task,
-                start.prompt_builder.told(task, seen=terms.sight),
-                evaluation_seed(seed, task.task.task_id),
-            )
-            for task in start.evaluated
-        ]
+        planned = [PlannedEpisode(task, evaluation_seed(seed, task.task.task_id)) for task in start.evaluated]
         return evaluate_in_episodes(
             workers,
             start.policy,
-            starts,
-            EpisodePlayers(self._gateway, terms, start.policy.codec),
+            planned,
+            EpisodeClient(self._gateway, terms, start.policy.codec),
             SamplingRule(samples, settings.temperature, self._settings.grpo.max_new),
             chunk=settings.chunk,
             seed=seed,

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import torch
 
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.data.tasks import TaskSet, load_tasks
 from embomatrix.trainer.policy.compute_dtype import torch_dtype
@@ -57,6 +58,10 @@ def forecast(dataset: Path, model: str, settings_file: Path | None, changes: Map
     Raises TrainerError.
     """
     settings = new_settings(model, settings_file, changes)
+    if settings.episodes.visibility is not None:
+        raise TrainerError(
+            "the plan of memory is for whole plans: leave out episodes.visibility (--episodes), or --plan-memory"
+        )
     if "device" not in settings.model_fields_set:
         settings = settings.model_copy(update={"device": GPU})
     word_level = is_word_level(model)

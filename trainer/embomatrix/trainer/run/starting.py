@@ -20,6 +20,7 @@ from embomatrix.trainer.config.settings import (
 )
 from embomatrix.trainer.data.tasks import TaskSet, TrainingTask, load_tasks
 from embomatrix.trainer.data.variation import Variation
+from embomatrix.trainer.episodes.terms import EpisodeTerms
 from embomatrix.trainer.lifecycle.checkpoint import (
     CHECKPOINTS,
     TrainingProgress,
@@ -117,7 +118,12 @@ class RunStart:
 
     @property
     def about_limits(self) -> tuple[str, ...]:
-        """Sentences about the limits of prompts and plans, and about the tasks that can't be expressed within them."""
+        """Sentences about the limits of prompts and plans, and about the tasks that can't be expressed within them.
+
+        Of episodes, the sentence says what the policy is told and how many calls it may make.
+        """
+        if (terms := EpisodeTerms.of(self.settings.episodes)) is not None:
+            return (terms.sentence,)
         limits = Limits(self.settings.prompt.rows, self.settings.grpo.max_new)
         ruler = Ruler.of_policy(self.policy)
         splits = {"training tasks": self.tasks.train, "held-out tasks": self.tasks.heldout}

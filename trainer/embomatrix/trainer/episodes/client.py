@@ -18,18 +18,16 @@ from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
 from embomatrix.trainer.episodes.terms import EpisodeTerms
 
 if TYPE_CHECKING:
-    from embomatrix.skills.prompt import Situation
     from embomatrix.trainer.data.tasks import TrainingTask
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class EpisodeStart:
-    """Start of an episode: a task, its situation as the policy is told of it, and the seed of the simulation."""
+class PlannedEpisode:
+    """Episode of a task that shall be played, and the seed of its simulation."""
 
     task: TrainingTask
-    situation: Situation
     seed: int
 
 
@@ -39,10 +37,13 @@ class ClusterEpisode:
     def __init__(self, player: EpisodePlayer) -> None:
         self.player = player
         self.opening: Prompt | None = None
+        self.answers: list[str] = []
+        """Answers of the policy so far."""
         self.lost: InfraFailure | None = None
 
     @property
     def is_over(self) -> bool:
+        """True if the episode takes no further answer."""
         return self.lost is not None or self.player.end is not None
 
     def stop(self) -> None:
@@ -55,6 +56,7 @@ class ClusterEpisode:
 
     async def answer(self, text: str) -> str:
         """Take an answer and return what the policy is told. Raises ClusterError if the manager can't be reached."""
+        self.answers.append(text)
         observation = await self._try(lambda: self.player.answer(text))
         return "" if observation is None else observation.text
 
@@ -68,8 +70,9 @@ class ClusterEpisode:
             self.lost = InfraFailure(InfraCode.PREFIX_MISMATCH, str(error))
         return None
 
-    def outcome(self, text: str) -> PlanOutcome:
-        """Return the outcome of the episode, whose answers are ``text``."""
+    def outcome(self) -> PlanOutcome:
+        """Return the outcome of the episode, with its answers as text, one a line."""
+        text = "\n".join(self.answers)
         if self.lost is not None:
             return PlanOutcome(text, None, self.lost)
         reward, steps = self.player.reward, tuple(self.player.steps)
@@ -77,29 +80,29 @@ class ClusterEpisode:
         return PlanOutcome(text, reward.tiers, problem=problem, cost=reward.cost, played=steps)
 
 
-class EpisodePlayers:
-    """Plays episodes through a gateway. Call its methods from any thread."""
+class EpisodeClient:
+    """Plays episodes in the run of a gateway. Call its methods from any thread, unless they say otherwise."""
 
     def __init__(self, gateway: Gateway, terms: EpisodeTerms, codec: Codec) -> None:
         self._gateway = gateway
         self._terms = terms
         self._codec = codec
 
-    def begin(self, starts: Sequence[EpisodeStart]) -> Future[list[ClusterEpisode]]:
+    def begin(self, planned: Sequence[PlannedEpisode]) -> Future[list[ClusterEpisode]]:
         """Begin episodes. The future fails with ClusterError if the manager can't be reached."""
-        return self._gateway.run(self.begin_all(starts))
+        return self._gateway.run(self.begin_all(planned))
 
     def run(self, work: Coroutine[Any, Any, T]) -> Future[T]:
         """Start work that plays episodes, on the gateway's thread."""
         return self._gateway.run(work)
 
-    async def begin_all(self, starts: Sequence[EpisodeStart]) -> list[ClusterEpisode]:
+    async def begin_all(self, planned: Sequence[PlannedEpisode]) -> list[ClusterEpisode]:
         """Begin episodes, on the gateway's thread. Raises ClusterError if the manager can't be reached."""
         episodes = []
-        for start in starts:
-            running = await self._gateway.begin_episode(start.task, start.seed, sight=self._terms.sight)
-            rules = self._terms.rules(start.task.oracle)
-            player = EpisodePlayer(running, start.situation, rules, self._codec, self._gateway.reward)
+        for each in planned:
+            running = await self._gateway.begin_episode(each.task, each.seed, sight=self._terms.sight)
+            rules = self._terms.rules(each.task.oracle)
+            player = EpisodePlayer(running, each.task.situation, rules, self._codec, self._gateway.reward)
             episodes.append(ClusterEpisode(player))
         await _all(episode.begin() for episode in episodes)
         return episodes

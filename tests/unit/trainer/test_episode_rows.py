@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,17 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fakes.symbolic_household import make_tasks
 
-from embomatrix.skills.episode_text import OBSERVATION_WORDS
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.skills.syntax import PROFILES
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.data.tasks import TaskSet
 from embomatrix.trainer.learning.likelihood import negative_log_likelihood, plan_tokens
-from embomatrix.trainer.policy.conversation import Conversation
 from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.episode_rows import EpisodeRows
 from embomatrix.trainer.policy.loading import new_policy
-from embomatrix.trainer.policy.protocol import Example
+from embomatrix.trainer.policy.protocol import ImitationExample
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.vocabulary import END, build_vocabulary
 from embomatrix.world.task import Profile
@@ -28,7 +28,7 @@ TASKS = make_tasks(12, 3)
 WORDS = build_vocabulary(
     [task.situation for task in (*TASKS.train, *TASKS.heldout)],
     [task.task.instruction for task in TASKS.train],
-    OBSERVATION_WORDS,
+    in_episodes=True,
 )
 ROOM = TASKS.train[0].situation.rooms[0]
 THING = f"{TASKS.train[0].situation.rows[0].category}_0"
@@ -61,17 +61,17 @@ def played(made, tasks, group, choices, *, turns=4, seed=0):
     """Play episodes. ``choices`` says for each row and turn what it is told, None to end it."""
     generator = torch.Generator().manual_seed(seed)
     asked = prompts(made, tasks)
-    conversation = Conversation(made, asked, group, 1.3, generator)
+    episodes = EpisodeRows(made, asked, group, 1.3, generator)
     rows, answers = list(range(tasks * group)), {}
     for turn in range(turns):
-        for row, answer in zip(rows, conversation.answer(rows), strict=True):
+        for row, answer in zip(rows, episodes.answer(rows), strict=True):
             answers.setdefault(row, []).append(answer)
         told = {row: choices[(row, turn)] for row in rows if choices.get((row, turn)) is not None}
         rows = sorted(told)
         if not rows:
             break
-        conversation.tell(rows, [TOLD[told[row]] for row in rows])
-    return asked, conversation.samples(), answers
+        episodes.tell(rows, [TOLD[told[row]] for row in rows])
+    return asked, episodes.samples(), answers
 
 
 CHOICES = st.dictionaries(
@@ -117,6 +117,32 @@ def test_every_answer_is_one_call_or_says_that_nothing_is_left_to_do():
     assert all("\n" not in answer for answer in said)
 
 
+def test_episodes_may_be_lost_before_the_first_answer():
+    generator = torch.Generator().manual_seed(0)
+    asked = prompts(POLICY, 2)
+    episodes = EpisodeRows(POLICY, asked, 2, 1.3, generator)
+    for _ in range(3):
+        episodes.answer([1, 2, 3])
+        episodes.tell([1, 2, 3], [TOLD[1]] * 3)
+    samples = episodes.samples()
+    assert not samples.mask[0].any()
+    scored = POLICY.logprobs(asked, samples.tokens, samples.mask, 2, 1.3)
+    assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=1e-5)
+
+
+def test_a_batch_without_any_answer_has_samples_without_own_words():
+    samples = EpisodeRows(POLICY, prompts(POLICY, 1), 2, 1.3, torch.Generator()).samples()
+    assert samples.mask.tolist() == [[False], [False]]
+    assert POLICY.logprobs(prompts(POLICY, 1), samples.tokens, samples.mask, 2, 1.3).logprobs.sum() == 0
+
+
+def test_rooms_without_objects_and_states_of_substances_have_words():
+    situation = replace(TASKS.train[0].situation, home=("hammam_0", ROOM))
+    words = build_vocabulary([situation], [], in_episodes=True)
+    assert {"hammam", ROOM.rpartition("_")[0]} <= set(words.room_words)
+    assert not words.unknown_words("did\nabsent\nfilled_with_water\nsoaked_with_water")
+
+
 def test_a_thing_can_be_named_once_the_policy_was_told_of_it():
     names = POLICY.grammar.prompt_names(torch.tensor(prompts(POLICY, 1)))
     stem, number = (torch.tensor([WORDS.index[word]]) for word in (THING.rpartition("_")[0], "_0"))
@@ -147,16 +173,17 @@ def test_other_episodes_of_a_game_change_no_log_probability():
 def test_an_episode_ends_where_the_context_has_no_room_for_another_answer():
     made = policy(longest=len(prompts(POLICY, 1)[0]) + 60)
     generator = torch.Generator().manual_seed(0)
-    conversation = Conversation(made, prompts(made, 1), 2, 1.0, generator)
+    episodes = EpisodeRows(made, prompts(made, 1), 2, 1.0, generator)
     for _ in range(60):
-        answers = conversation.answer([0, 1])
+        answers = episodes.answer([0, 1])
         if answers == [None, None]:
             break
         rows = [row for row, answer in enumerate(answers) if answer is not None]
-        conversation.tell(rows, [TOLD[2]] * len(rows))
+        episodes.tell(rows, [TOLD[2]] * len(rows))
         if len(rows) < 2:
             break
-    samples = conversation.samples()
+    samples = episodes.samples()
+    assert samples.cut_off.any()
     asked = prompts(made, 1)
     scored = made.logprobs(asked, samples.tokens, samples.mask, 2, 1.0)
     assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=1e-5)
@@ -168,7 +195,7 @@ def test_what_the_policy_is_told_is_not_imitated():
     call, told = POLICY.encode_plan(f"go_to_room {ROOM}"), POLICY.encode_told(TOLD[0])
     plan = (*call, *told, END)
     marks = (False,) * len(call) + (True,) * len(told) + (False,)
-    example = Example(prompt, plan, marks)
+    example = ImitationExample(prompt, plan, marks)
     assert plan_tokens([example]) == example.own == len(call) + 1
     tokens = torch.tensor([plan])
     own = ~torch.tensor([marks])

@@ -32,6 +32,8 @@ class _Row:
     own: list[bool] = field(default_factory=list)
     logprobs: list[float] = field(default_factory=list)
     answers: list[str] = field(default_factory=list)
+    is_full: bool = False
+    """True if the context had no room for another answer."""
 
     def add(self, tokens: Sequence[int], logprobs: Sequence[float] | None) -> None:
         """Append tokens. Those that the policy was told have no log-probabilities."""
@@ -40,7 +42,7 @@ class _Row:
         self.logprobs += [0.0] * len(tokens) if logprobs is None else logprobs
 
 
-class Conversation:
+class EpisodeRows:
     """``group`` episodes for each prompt: row q * group + i is episode i of prompt q. Each is answered, then told, in turn."""
 
     def __init__(
@@ -67,11 +69,6 @@ class Conversation:
         self._plan: PlanCache | None = None
         self._states = self._prompts.last.repeat_interleave(group, dim=0)  # (rows, 1, C)
 
-    @property
-    def answers(self) -> list[list[str]]:
-        """Answers of each row so far."""
-        return [row.answers for row in self._rows]
-
     @torch.no_grad()
     def answer(self, rows: Sequence[int]) -> list[str | None]:
         """Sample the next answer of each of these rows. All others have ended.
@@ -79,6 +76,8 @@ class Conversation:
         An answer is None if the context has no room for another one; then the row has ended.
         """
         room = {row for row in rows if self._room(row) >= _LONGEST_ANSWER}
+        for row in set(rows) - room:
+            self._rows[row].is_full = True
         if not room:
             return [None] * len(rows)
         answers = dict(zip(sorted(room), self._sample(sorted(room)), strict=True))
@@ -149,6 +148,8 @@ class Conversation:
             policy.encode_told(told[row])[: max(0, self._room(row))] if row in told else ()
             for row in self._playing.tolist()
         ]
+        if not any(encoded):
+            return
         for row, words in zip(self._playing.tolist(), encoded, strict=True):
             self._rows[row].add(words, None)
         tokens = pad_sequence([torch.tensor(words, dtype=torch.long) for words in encoded], True, PAD)
@@ -178,14 +179,20 @@ class Conversation:
         self._plan = self._plan.select(kept) if self._plan else None
 
     def samples(self) -> Samples:
-        """Return all rows as samples, without what they were told at their end. Texts are answers, one a line."""
+        """Return all rows as samples, without what they were told at their end. Texts are answers, one a line.
+
+        Cut-off rows are those whose context had no room for another answer. There is at least one column.
+        """
         device = self._policy.device
         for row in self._rows:
             last = max((at for at, own in enumerate(row.own, 1) if own), default=0)
             del row.tokens[last:], row.own[last:], row.logprobs[last:]
 
         def padded(values: Sequence[Sequence[float]], kind: torch.dtype) -> Tensor:
-            return pad_sequence([torch.tensor(each, dtype=kind) for each in values], True).to(device)
+            longest = [0] * max(1, *map(len, values))
+            return pad_sequence([torch.tensor(each, dtype=kind) for each in (*values, longest)], True)[
+                :-1
+            ].to(device)
 
         mask = padded([row.own for row in self._rows], torch.bool)
         return Samples(
@@ -193,5 +200,5 @@ class Conversation:
             mask,
             padded([row.logprobs for row in self._rows], torch.float32),
             tuple("\n".join(row.answers) for row in self._rows),
-            torch.zeros(len(mask), dtype=torch.bool, device=device),
+            torch.tensor([row.is_full for row in self._rows], device=device),
         )
