@@ -52,10 +52,16 @@ COMMANDS: Final[dict[str, Command]] = {
         {"torch": "trainer", "PIL": "factory"},
     ),
     "imitate": Command(
-        "Training and evaluation", "warm up a policy on oracle plans, without a cluster", "trainer"
+        "Training and evaluation",
+        "warm up a policy on oracle plans, without a cluster",
+        "trainer",
+        {"scipy": "physics"},
     ),
     "train": Command(
-        "Training and evaluation", "train a policy with imitation and GRPO on a cluster", "trainer"
+        "Training and evaluation",
+        "train a policy with imitation and GRPO on a cluster",
+        "trainer",
+        {"scipy": "physics"},
     ),
     "eval": Command(
         "Training and evaluation",
@@ -64,7 +70,9 @@ COMMANDS: Final[dict[str, Command]] = {
         {"scipy": "physics"},
     ),
     "eai": Command("Training and evaluation", "install and run the judge of the EAI benchmark", "trainer"),
-    "model": Command("Training and evaluation", "import a packaged language model", "hf"),
+    "model": Command(
+        "Training and evaluation", "import a packaged language model", "hf", {"scipy": "physics"}
+    ),
     "experiment": Command("Measurements", "repeat the paper's experiments: curves, tables, times", "all"),
     "bench": Command("Measurements", "measure rollouts and the cluster on this machine", "bench"),
 }
