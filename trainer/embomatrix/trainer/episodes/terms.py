@@ -38,7 +38,7 @@ class EpisodeTerms:
 
     @property
     def sentence(self) -> str:
-        """What the policy is told and how many calls it may make, for a person."""
+        """Sentence for a person: what the policy is told, and how many calls it may make."""
         told = "what the robot has seen" if self.sight else "all objects of the task"
         budget = f"{self.calls_factor:g} times the calls of the oracle plan and {self.calls_more} more, at most {MAX_STEPS}"
         return f"episodes: the policy is told of {told}, and may make {budget}"
