@@ -16,7 +16,7 @@ from embomatrix.cli.local_cluster import LocalCluster, cluster_problem, local_cl
 from embomatrix.envs.rules import Visibility
 from embomatrix.host.failure import fail
 from embomatrix.starter.options import DATASET_VARIABLE, DEFAULT_DATASET
-from embomatrix.starter.shipped import NAMED, demo_settings, unpack
+from embomatrix.starter.shipped import demo_settings, is_named, unpack
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 
 DEFAULT_OUT: Final = Path("runs/demo")
@@ -62,15 +62,15 @@ def demo(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     folder = _folder(out)
     started_s = time.monotonic()
-    is_named = str(dataset) in NAMED and not dataset.exists()
-    if not is_named:
+    ships = is_named(dataset)
+    if not ships:
         _ensure_tasks(dataset)
     built_s = time.monotonic()
-    shown = None if is_named else dataset
+    shown = None if ships else dataset
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=shown)
     with cluster.supervisor:
         _announce(cluster, slots)
-        minutes = None if is_named or episodes else _minutes(dataset, model, imitate_steps, steps)
+        minutes = None if ships or episodes else _minutes(dataset, model, imitate_steps, steps)
         options = [
             f"--model={model}",
             f"--steps={steps}",
@@ -99,10 +99,7 @@ def demo(
         highlight=False,
     )
     task_id = _most_successful_task(folder)
-    if episodes is not None:
-        bench = f"--bench {dataset} --visibility {episodes.value}"
-        typer.echo(f"try next: embomatrix eval --model {folder} --interactive --samples 1 {bench}")
-    elif task_id and not is_named:
+    if task_id:
         # Rich would wrap a line that is meant to be copied.
         typer.echo(f"try next: embomatrix play {task_id} --policy {folder} --dataset {dataset}")
 

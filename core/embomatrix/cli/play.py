@@ -7,7 +7,7 @@ import contextlib
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import typer
 from rich.console import Console
@@ -37,13 +37,17 @@ from embomatrix.skills.prompt import Codec, Situation, limited, prompt_for, situ
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, MAX_STEPS, Plan
 from embomatrix.skills.trace import Trace
 from embomatrix.starter.options import DatasetOrShipped
-from embomatrix.starter.shipped import dataset_folder
+from embomatrix.starter.shipped import open_dataset
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset, TaskRecord
 from embomatrix.world.evaluate import GoalError
 from embomatrix.world.task import Task
 
 NO_PLAN: Final = 1
+
+if TYPE_CHECKING:
+    from embomatrix.trainer.config.settings import TrainSettings
+    from embomatrix.trainer.policy.protocol import Policy
 
 console = Console(highlight=False)
 
@@ -58,6 +62,18 @@ class PlayMode(StrEnum):
 
     CACHED = "cached"
     PHYSICAL = "physical"
+
+
+class LoadedPolicy(NamedTuple):
+    """Trained policy, and the settings of its training."""
+
+    policy: "Policy"
+    settings: "TrainSettings"
+
+
+def plays_episodes(policy: object) -> bool:
+    """Return True for a policy that was trained in episodes."""
+    return bool(getattr(policy, "single_calls", False))
 
 
 def play(
@@ -79,7 +95,8 @@ def play(
     policy: Annotated[
         str | None,
         typer.Option(
-            help="Execute the plan of a trained policy: the folder of a run, such as runs/demo, or `shipped`."
+            help="Execute the plan of a trained policy: the folder of a run, such as runs/demo, or `shipped`. A policy "
+            "for episodes plays one."
         ),
     ] = None,
     show: Annotated[
@@ -120,12 +137,18 @@ def play(
             )
         if visibility is Visibility.SEEN and not interactive:
             fail("--visibility seen is for --interactive: a plan is written before anything is seen")
-        data = Dataset.load(dataset_folder(dataset))
+        data = open_dataset(dataset)
         record = _record_of(data, task)
         bundle = data.bundle(record.bundle_digest)
         text = _text_of(plan) if plan else None
         if visibility is Visibility.SEEN:
             _explore_by_hand(data.folder, record, seed)
+            return
+        trained = _load_policy(policy) if policy is not None else None
+        if trained is not None and plays_episodes(trained.policy):
+            if film is not None or mode is PlayMode.PHYSICAL:
+                fail(f"{policy} plays episodes and writes no plans: leave out --film and --mode")
+            _watch(trained, data.folder, record, seed)
             return
         _show_task(record.task)
         if show:
@@ -134,7 +157,7 @@ def play(
             _show_prompt(bundle, record.task)
             _play_by_hand(bundle, record.task, seed)
         else:
-            found = _plan_of(bundle, record.task, text, policy, seed)
+            found = _plan_of(bundle, record.task, text, trained, seed)
             _run(bundle, record.task, found, mode, seed, film)
 
 
@@ -148,7 +171,7 @@ def _record_of(data: Dataset, named: str) -> TaskRecord:
     return record
 
 
-def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: str | None, seed: int) -> Plan:
+def _plan_of(bundle: Bundle, task: Task, text: str | None, policy: LoadedPolicy | None, seed: int) -> Plan:
     """Parse the text, or ask the policy, or else the oracle. Exit if there is no plan."""
     if text is None and policy is None:
         found = find_plan(load_simulator(bundle), task)
@@ -212,29 +235,51 @@ def _play_by_hand(bundle: Bundle, task: Task, seed: int) -> None:
         console.print(plan_to_lines(calls), markup=False)
 
 
-def _plan_of_policy(named: str, situation: Situation, seed: int) -> Plan:
+def _load_policy(named: str) -> LoadedPolicy:
+    """Load a trained policy. Exit with a message if there is none."""
+    from embomatrix.trainer.config.errors import TrainerError
+    from embomatrix.trainer.evaluation.models import load_model
+
+    try:
+        return LoadedPolicy(*load_model(named, None, threads=None, device="cpu"))
+    except TrainerError as error:
+        fail(str(error))
+
+
+def _plan_of_policy(loaded: LoadedPolicy, situation: Situation, seed: int) -> Plan:
     """Return the most probable plan of a trained policy. Raises PlanError if it writes none."""
     import torch
 
     from embomatrix.trainer.cluster.gateway import parse_policy_text
     from embomatrix.trainer.config.errors import TrainerError
-    from embomatrix.trainer.evaluation.models import load_model
     from embomatrix.trainer.policy.limits import Ruler, room_for
-    from embomatrix.trainer.policy.tiny import TinyPolicy
 
+    policy, settings = loaded.policy, loaded.settings
     try:
-        policy, settings = load_model(named, None, threads=None, device="cpu")
         asked = limited(situation, settings.prompt.rows)
         prompt = prompt_for(asked, policy.codec)
         max_new = room_for(settings.grpo.max_new, {situation.instruction: prompt}, Ruler.of_policy(policy))
     except TrainerError as error:
         fail(str(error))
-    if isinstance(policy, TinyPolicy) and policy.single_calls:
-        fail(
-            f"{named} plays episodes and writes no plans: run `embomatrix eval --interactive --model {named}`"
-        )
     drawn = policy.sample([policy.encode(prompt)], 1, 0.0, max_new, torch.Generator().manual_seed(seed))
     return parse_policy_text(drawn.texts[0], asked, policy.codec)
+
+
+def _watch(loaded: LoadedPolicy, folder: Path, record: TaskRecord, seed: int) -> None:
+    """Let a policy that was trained in episodes play one, and print all that it says and is told."""
+    from embomatrix.cli.play_by_policy import play_by_policy
+    from embomatrix.skills.parse import plan_from_json
+    from embomatrix.trainer.episodes.terms import EpisodeTerms
+    from embomatrix.trainer.policy.tiny import TinyPolicy
+
+    assert isinstance(loaded.policy, TinyPolicy), "no other policy plays episodes"
+    terms = EpisodeTerms.of(loaded.settings.episodes)
+    oracle = plan_from_json([*record.oracle], record.task.profile) if record.oracle else ()
+    rules = EpisodeRules() if terms is None else terms.rules(oracle)
+    with make(folder, split=record.split, rules=rules, codec=Codec.NAMES) as environment:
+        reward = play_by_policy(environment, loaded.policy, record.task.task_id, seed, _show_lines)
+    if reward is not None:
+        _show_reward(reward.tiers)
 
 
 def _show_prompt(bundle: Bundle, task: Task) -> None:

@@ -77,6 +77,18 @@ def dataset_named(named: str | Path) -> Dataset:
     return Dataset.load(unpacked_tasks() if named == STARTER else named)
 
 
+def is_named(folder: Path) -> bool:
+    """Return True if this is no folder, but the name of a dataset that ships."""
+    return str(folder) in NAMED and not folder.exists()
+
+
+def open_dataset(folder: Path | None) -> Dataset:
+    """Load the dataset in a folder, by its name if it ships, or that of ``dataset_folder``. Raises DatasetError or OSError."""
+    if folder is not None and is_named(folder):
+        return dataset_named(str(folder))
+    return Dataset.load(dataset_folder(folder))
+
+
 def unpack(folder: Path, parts: Iterable[int] = tuple(PARTS)) -> str:
     """Write shipped parts to a folder as one dataset, by default the starter dataset: all of them.
 

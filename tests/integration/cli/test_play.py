@@ -213,6 +213,23 @@ def test_newest_checkpoint_of_a_run_writes_the_plan(run, folder, tmp_path):
     assert "nothing" in refused.output
 
 
+def test_policy_for_episodes_plays_and_all_texts_are_printed(run, folder, tmp_path):
+    tasks = load_tasks(folder)
+    shape = {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16}
+    settings = read_settings(None, {**shape, "episodes.visibility": "seen"})
+    progress = TrainingProgress(step=1, grpo_ready=True)
+    CheckpointStore(tmp_path / CHECKPOINTS, keep=1).save(new_policy(settings, tasks), {}, progress, settings)
+    result = run("apple_to_counter", "--policy", str(tmp_path))
+    assert result.exit_code == 0, result.output
+    lines = result.output.splitlines()
+    assert lines[0].startswith("rooms kitchen_0")
+    said = [at for at, line in enumerate(lines) if line.startswith("> ")]
+    assert all(lines[at + 1].split()[0] in ("did", "failed", "robot") for at in said)
+    assert "Reward" in result.output
+    refused = run("apple_to_counter", "--policy", str(tmp_path), "--mode", "physical")
+    assert (refused.exit_code, "leave out --film and --mode" in refused.output) == (2, True)
+
+
 def test_oracle_option_solves_the_task(run):
     result = run("cook_chicken", "--oracle")
     assert result.exit_code == 0

@@ -371,7 +371,7 @@ def _show_summary(summary: TrainingSummary) -> None:
     console.print(
         f"{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts, "
         f"{outcome.lost} lost and masked, {stats.redispatched} re-dispatched; "
-        f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, prewarm hits {prewarm_share(stats):.0%}, "
+        f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, prewarm hits {prewarm_share(stats)}, "
         f"{stats.shared_share:.0%} of the steps shared; "
         f"peak memory {outcome.peak_mb:,.0f} MB",
         highlight=False,

@@ -10,18 +10,13 @@ import numpy as np
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.skills.prompt import Situation, situation_of
 from embomatrix.skills.syntax import Plan
-from embomatrix.starter.shipped import NAMED, dataset_named
+from embomatrix.starter.shipped import open_dataset
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.world.asset import Asset
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
-
-
-def is_named(folder: Path) -> bool:
-    """Return True if a folder is none, but the name of a dataset that ships."""
-    return str(folder) in NAMED and not folder.exists()
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +47,7 @@ def load_tasks(folder: Path) -> TaskSet:
     """Load a dataset folder, or a shipped one by its name. Raises TrainerError if it is missing or damaged."""
     kinds = KindTable()
     try:
-        dataset = dataset_named(str(folder) if is_named(folder) else folder)
+        dataset = open_dataset(folder)
     except (DatasetError, OSError) as error:
         raise TrainerError(str(error)) from error
     tasks = read_tasks(dataset, kinds.add)

@@ -103,10 +103,10 @@ def _only(evaluation: HeldOutEvaluation, category: str) -> HeldOutEvaluation:
     return type(evaluation)(tuple(s for s in evaluation.scores if category in ("", s.category)))
 
 
-def prewarm_share(stats: RunStats) -> float:
-    """Share of announced scenes that were warm when needed, 0 without any."""
+def prewarm_share(stats: RunStats) -> str:
+    """Share of announced scenes that were warm when needed; a dash without any, as in episodes."""
     asked = stats.prewarm_hits + stats.prewarm_misses
-    return stats.prewarm_hits / asked if asked else 0.0
+    return f"{stats.prewarm_hits / asked:.0%}" if asked else "–"
 
 
 def write_report(
@@ -169,7 +169,7 @@ def _story(summary: TrainingSummary) -> str:
         f"{table or '<p>The dataset has no held-out tasks.</p>'}"
         f"<p>{outcome.imitation_steps:,} steps of imitation, then {outcome.steps:,} of GRPO with "
         f"{outcome.rollouts:,} rollouts. The infrastructure lost {outcome.lost:,} rollouts, which are masked. "
-        f"{prewarm_share(stats):.0%} of the announced scenes were warm in time, and {stats.shared_share:.0%} of the steps "
+        f"{prewarm_share(stats)} of the announced scenes were warm in time, and {stats.shared_share:.0%} of the steps "
         "were shared between plans.</p>"
     )
 
