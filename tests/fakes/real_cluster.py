@@ -151,6 +151,21 @@ async def connected(client, *names, limit_s=60.0):
             await asyncio.sleep(0.05)
 
 
+@contextlib.contextmanager
+def one_real_worker(folder):
+    """Cluster of a manager and one worker that executes plans, connected."""
+
+    async def ready(cluster):
+        async with cluster.client() as client:
+            await connected(client, "w1")
+
+    with RealCluster(folder) as started:
+        started.start_manager()
+        started.start_real_worker("w1")
+        asyncio.run(ready(started))
+        yield started
+
+
 @contextlib.asynccontextmanager
 async def two_workers(folder, **settings):
     """Start a cluster with the ready workers ``w1`` and ``w2``, and a client."""

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.fakes.real_cluster import one_real_worker
 from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import make_tasks
 from tests.unit.trainer.conftest import one_thread, small_files  # noqa: F401
@@ -16,6 +17,13 @@ from embomatrix.trainer.policy.import_gguf import import_gguf
 
 SMALL_TASKS = make_tasks(6, 2, objects=8)
 """Few tasks with few objects, for language models."""
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """Cluster of a manager and one worker that executes plans, each in its own process."""
+    with one_real_worker(tmp_path_factory.mktemp("cluster")) as started:
+        yield started
 
 
 @pytest.fixture(scope="module")

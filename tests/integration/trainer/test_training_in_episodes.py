@@ -8,7 +8,6 @@ import pytest
 import torch
 from rich.console import Console
 from tests.fakes.datasets import write_kitchen_dataset
-from tests.fakes.real_cluster import RealCluster, connected
 
 from embomatrix.rpc.episodes import TurnFailedError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
@@ -48,20 +47,6 @@ SETTINGS = {
     "checkpoint_every": 1,
 }
 TIMES = ("seconds", "spent_s")
-
-
-async def ready(cluster):
-    async with cluster.client() as client:
-        await connected(client, "w1")
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory):
-    with RealCluster(tmp_path_factory.mktemp("cluster")) as started:
-        started.start_manager()
-        started.start_real_worker("w1")
-        asyncio.run(ready(started))
-        yield started
 
 
 @pytest.fixture(scope="module")

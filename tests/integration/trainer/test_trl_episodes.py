@@ -5,7 +5,7 @@ import asyncio
 import pytest
 from tests.fakes import waiting
 from tests.fakes.datasets import write_kitchen_dataset
-from tests.fakes.real_cluster import RealCluster, connected
+from tests.fakes.real_cluster import one_real_worker
 
 from embomatrix.envs.rules import EpisodeRules
 from embomatrix.rpc.status import UnavailableError
@@ -19,20 +19,6 @@ TASK = "apple_to_counter"
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     return write_kitchen_dataset(tmp_path_factory.mktemp("dataset"))
-
-
-async def ready(cluster):
-    async with cluster.client() as client:
-        await connected(client, "w1")
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory):
-    with RealCluster(tmp_path_factory.mktemp("cluster")) as started:
-        started.start_manager()
-        started.start_real_worker("w1")
-        asyncio.run(ready(started))
-        yield started
 
 
 @pytest.fixture
@@ -132,10 +118,7 @@ def _raising(error):
 
 
 def test_scenes_of_announced_tasks_are_loaded_before_their_first_turn(dataset, tmp_path):
-    with RealCluster(tmp_path) as fresh:
-        fresh.start_manager()
-        fresh.start_real_worker("w1")
-        asyncio.run(ready(fresh))
+    with one_real_worker(tmp_path) as fresh:
         opened = ClusterEpisodes.at(dataset, fresh.address)
         opened.announce([[TASK]], 2)
         asyncio.run(waiting.until(lambda: "scene warm" in fresh.log("w1"), 60))
