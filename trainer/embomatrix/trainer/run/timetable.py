@@ -15,6 +15,7 @@ from embomatrix.trainer.logging.run_clock import Phase, PhaseTime, RunClock
 from embomatrix.trainer.policy.loading import is_word_level
 
 if TYPE_CHECKING:
+    from embomatrix.trainer.config.settings import TrainSettings
     from embomatrix.trainer.run.starting import RunStart
 
 
@@ -24,7 +25,7 @@ def clock_of(start: RunStart, *, began_s: float, warn_after_s: float | None = No
     With a budget of minutes the number of evaluations during GRPO is unknown, and they are left out.
     """
     settings, progress = start.settings, start.progress
-    typical = is_word_level(settings.model)
+    typical = _is_typical(settings)
     grpo, samples = settings.grpo, settings.evaluation.samples
     during = evaluations_during(settings.evaluation, grpo.steps or 0, begun_at=progress.step)
     by_label = {BEFORE: samples, AFTER: samples, DURING: settings.evaluation.samples_during if during else 0}
@@ -50,11 +51,16 @@ def _imitation(start: RunStart) -> PhaseTime:
     is_over = state.done or start.progress.grpo_ready
     return PhaseTime(
         typical_s=IMITATION_STEP_S * settings.steps
-        if is_word_level(start.settings.model) and settings.steps
+        if _is_typical(start.settings) and settings.steps
         else None,
         budget_s=settings.seconds if settings.steps is None else None,
         share=1.0 if is_over else _share(state.step, state.seconds, settings.steps, settings.seconds),
     )
+
+
+def _is_typical(settings: TrainSettings) -> bool:
+    """Return True for runs with typical times: of the word-level policy, on whole plans."""
+    return is_word_level(settings.model) and settings.episodes.visibility is None
 
 
 def _share(step: int, spent_s: float, steps: int | None, budget_s: float) -> float:
