@@ -17,6 +17,8 @@ from embomatrix.host.parent import with_this_process
 
 MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})
 SERVER_PORTS: Final = range(20_000, 32_768)
+_RESERVED: Final[list[socket.socket]] = []
+"""UDP sockets with the numbers of the ports that ``free_port`` returned. Nothing else here uses UDP."""
 
 MEMORY_SHARE: Final = 0.1
 """Share of the free memory for the scenes of all workers together. The trainer and a person's other programs need the rest, and
@@ -69,7 +71,7 @@ def without_membership(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def free_port() -> int:
-    """Return a TCP port that is free on the loopback interface at the moment.
+    """Return a TCP port that is free on the loopback interface, and that no other call returns while this process lives.
 
     It lies below the range from which Linux takes the ports of outgoing connections, so that none of them occupies it
     before its server does.
@@ -78,7 +80,19 @@ def free_port() -> int:
         port = random.SystemRandom().choice(SERVER_PORTS)
         with socket.socket() as probe, contextlib.suppress(OSError):
             probe.bind(("127.0.0.1", port))
+            _reserve(port)
             return port
+
+
+def _reserve(port: int) -> None:
+    """Keep other processes from choosing this port before its server has it. Raises OSError if one has chosen it."""
+    reserved = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        reserved.bind(("127.0.0.1", port))
+    except OSError:
+        reserved.close()
+        raise
+    _RESERVED.append(reserved)
 
 
 def run_command(command: str, problem: Callable[[], str], *arguments: str) -> None:
