@@ -16,3 +16,9 @@ def reason_of(error: BaseException) -> str:
     text = (error.strerror or "") if isinstance(error, OSError) else ""
     lines = (text or str(error)).strip().splitlines() or [type(error).__name__]
     return lines[0].split(". ")[0].rstrip(".")
+
+
+def first_of(errors: ExceptionGroup[Exception]) -> Exception:
+    """Return the first single error of a group."""
+    first = errors.exceptions[0]
+    return first_of(first) if isinstance(first, ExceptionGroup) else first

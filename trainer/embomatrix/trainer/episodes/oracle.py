@@ -19,7 +19,7 @@ from embomatrix.skills.episode_text import FORMAT
 from embomatrix.skills.parse import DONE
 from embomatrix.skills.prompt import Prompt, plan_in_names
 from embomatrix.trainer.cluster.gateway import PlanOutcome, refuse_without_workers, result_of
-from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError, first_of
 from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, PlannedEpisode
 from embomatrix.trainer.policy.protocol import ImitationExample
 from embomatrix.world.json_text import parse_json
@@ -120,9 +120,8 @@ def oracle_episodes(
     try:
         result_of(playing)
     except ExceptionGroup as errors:
-        if (found := errors.subgroup(ClusterError)) is None:
-            raise
-        raise TrainerError(str(_first(found))) from errors
+        first = first_of(errors)
+        raise (TrainerError(str(first)) if isinstance(first, ClusterError) else first) from errors
     report(len(planned), len(planned))
     refuse_without_workers(progress.outcomes, "the oracle's episodes")
     if not progress.found:
@@ -135,11 +134,6 @@ def oracle_episodes(
     rows = {task_id: [episode.opening, *episode.turns] for task_id, episode in kept.items()}
     write_whole(path, json.dumps({"version": version, "episodes": rows}).encode("utf-8"))
     return kept
-
-
-def _first(errors: BaseExceptionGroup[BaseException]) -> BaseException:
-    first = errors.exceptions[0]
-    return _first(first) if isinstance(first, BaseExceptionGroup) else first
 
 
 async def _play_all(planned: Sequence[PlannedEpisode], client: EpisodeClient, progress: _Progress) -> None:

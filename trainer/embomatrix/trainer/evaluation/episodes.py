@@ -25,7 +25,7 @@ from embomatrix.scripts.searching import PlacePriors, SearchingScript
 from embomatrix.skills.parse import DONE, plan_to_lines
 from embomatrix.skills.prompt import Codec, Prompt, prompt_for
 from embomatrix.skills.seeds import evaluation_seed
-from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.config.errors import TrainerError, first_of
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.episodes.terms import EpisodeTerms
 from embomatrix.trainer.evaluation.answer_sources import PURPOSE, OnProgress, seed_of
@@ -103,7 +103,7 @@ class EpisodeStage:
             try:
                 asyncio.run(self._run(setup, list(by_scene.values()), play, within))
             except ExceptionGroup as errors:
-                raise _first(errors) from errors
+                raise first_of(errors) from errors
 
     async def _run(
         self,
@@ -140,11 +140,6 @@ class EpisodeStage:
 
 def _terms_of(setup: EvaluationSetup) -> EpisodeTerms:
     return EpisodeTerms(Visibility(setup.visibility), setup.calls_factor, setup.calls_more)
-
-
-def _first(errors: ExceptionGroup[Exception]) -> Exception:
-    first = errors.exceptions[0]
-    return _first(first) if isinstance(first, ExceptionGroup) else first
 
 
 def play_episodes(
