@@ -150,7 +150,7 @@ def evaluate_policy(
     jobs = []
     for number, chunk in enumerate(chunks):
         prompts = [prompt_builder.plain(task) for task in chunk]
-        draw = begin_drawing(server, [prompt.tokens for prompt in prompts], _seed_of(seed, number), rule)
+        draw = begin_drawing(server, [prompt.tokens for prompt in prompts], chunk_seed(seed, number), rule)
         jobs.append((number, functools.partial(sample, number, chunk, prompts, draw)))
     workers.map(jobs)
     collected.take_all()
@@ -196,7 +196,7 @@ class _Collected:
         self.report(len(self.scores))
 
 
-def _seed_of(seed: int, chunk: int) -> int:
+def chunk_seed(seed: int, chunk: int) -> int:
     """Return the seed of a chunk's plans."""
     return int(np.random.SeedSequence((seed, chunk)).generate_state(1)[0])
 

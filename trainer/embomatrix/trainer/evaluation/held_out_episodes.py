@@ -6,13 +6,11 @@ import json
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from embomatrix.trainer.cluster.gateway import refuse_without_workers
 from embomatrix.trainer.episodes.batches import EpisodeBatch, PlayedBatch, play_batches
 from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, PlannedEpisode
 from embomatrix.trainer.evaluation.episodes import episode_verdict
-from embomatrix.trainer.evaluation.held_out import HeldOutAnswer, HeldOutEvaluation, task_score
+from embomatrix.trainer.evaluation.held_out import HeldOutAnswer, HeldOutEvaluation, chunk_seed, task_score
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 from embomatrix.trainer.learning.learner import SamplingRule
 
@@ -41,7 +39,7 @@ def evaluate_in_episodes(
     ``chunk`` tasks are a batch with a seed of its own. Raises TrainerError if the cluster failed, or no worker took any turn.
     """
     parts = [planned[at : at + chunk] for at in range(0, len(planned), chunk)]
-    batches = [EpisodeBatch(index, part, _seed_of(seed, index)) for index, part in enumerate(parts)]
+    batches = [EpisodeBatch(index, part, chunk_seed(seed, index)) for index, part in enumerate(parts)]
     size = _EACH * workers.count
     found = HeldOutEvaluation(())
     report(0, len(planned))
@@ -63,10 +61,6 @@ def _with_batch(found: HeldOutEvaluation, played: PlayedBatch) -> HeldOutEvaluat
             _answer(planned.task, sample, episode) for sample, episode in enumerate(played.of_task(number))
         ]
     return HeldOutEvaluation(tuple(scores), tuple(answers))
-
-
-def _seed_of(seed: int, batch: int) -> int:
-    return int(np.random.SeedSequence((seed, batch)).generate_state(1)[0])
 
 
 def _answer(task: TrainingTask, sample: int, episode: ClusterEpisode) -> HeldOutAnswer:

@@ -17,7 +17,7 @@ from torch.nn.utils.rnn import pad_sequence
 from embomatrix.trainer.policy.compute_dtype import frozen_weights
 from embomatrix.trainer.policy.decoder import PlanCache, Shortlist
 from embomatrix.trainer.policy.protocol import Samples, Tokens, draw, pad_left
-from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.policy.tiny import TinyPolicy, rows_to_keep
 from embomatrix.trainer.policy.vocabulary import END, PAD
 
 _LONGEST_ANSWER: Final = 16
@@ -165,14 +165,12 @@ class EpisodeRows:
     def _drop_all_but(self, rows: Sequence[int]) -> None:
         """Leave out ended rows. Some are kept, so that each remaining prompt has equally many."""
         active = torch.isin(self._playing, torch.tensor(rows, device=self._playing.device))
-        active = active.view(len(self._prompts.lengths), -1)  # (Q, G)
-        left = active.sum(dim=1)
-        prompts = left.nonzero()[:, 0]
-        first = active[prompts].int().argsort(dim=1, descending=True, stable=True)[:, : int(left.max())]
-        kept = (prompts[:, None] * active.shape[1] + first).flatten()
+        count = len(self._prompts.lengths)
+        kept = rows_to_keep(active, count)
         if len(kept) == len(self._playing):
             return
-        if len(prompts) < len(self._prompts.lengths):
+        prompts = torch.unique(kept * count // len(active))
+        if len(prompts) < count:
             self._prompts = self._prompts.select(prompts)
         self._playing, self._names = self._playing[kept], self._names.select(kept)
         self._grammar_state, self._states = self._grammar_state.select(kept), self._states[kept]

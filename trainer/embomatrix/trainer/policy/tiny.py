@@ -78,14 +78,6 @@ class _SamplingState:
             grammar_state=grammar.advance(self.grammar_state, choice, self.names),
         )
 
-    def rows_to_keep(self) -> Tensor:
-        """Indices of the active plans. Finished ones are added so that each remaining prompt keeps equally many."""
-        active = self.active.view(len(self.prompts.lengths), -1)  # (Q, G)
-        left = active.sum(dim=1)
-        prompts = left.nonzero()[:, 0]
-        first = active[prompts].argsort(dim=1, descending=True, stable=True)[:, : int(left.max())]
-        return (prompts[:, None] * active.shape[1] + first).flatten()
-
     def select(self, kept: Tensor) -> _SamplingState:
         """State of the given rows only."""
         prompt_of_row = kept * len(self.prompts.lengths) // len(self.active)
@@ -99,6 +91,15 @@ class _SamplingState:
             self.grammar_state.select(kept),
             self.plan.select(kept) if self.plan else None,
         )
+
+
+def rows_to_keep(active: Tensor, prompts: int) -> Tensor:
+    """Return indices of the active rows (rows,). Finished ones are added so that each remaining prompt keeps equally many."""
+    grouped = active.view(prompts, -1)  # (Q, G)
+    left = grouped.sum(dim=1)
+    remaining = left.nonzero()[:, 0]
+    first = grouped[remaining].argsort(dim=1, descending=True, stable=True)[:, : int(left.max())]
+    return (remaining[:, None] * grouped.shape[1] + first).flatten()
 
 
 class TinyPolicy:
@@ -179,7 +180,7 @@ class TinyPolicy:
                 mask[rows, at] = active
                 length = at + 1
                 state = state.advance(choice, self.grammar)
-                kept = state.rows_to_keep()
+                kept = rows_to_keep(state.active, len(state.prompts.lengths))
                 if len(kept) == 0:
                     break
                 if len(kept) <= _COMPACTION_THRESHOLD * len(state.active):
