@@ -66,7 +66,7 @@ class Subject:
 def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
     """Load the model. Raises TrainerError."""
     from embomatrix.trainer.evaluation.models import load_model
-    from embomatrix.trainer.policy.tiny import TinyPolicy
+    from embomatrix.trainer.policy.tiny import plays_episodes
 
     policy, trained = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
     if isinstance(exam, NativeExam) and policy.codec is Codec.NAMES:
@@ -78,7 +78,7 @@ def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
     max_tokens = settings.max_tokens or room_for(trained.grpo.max_new, prompts, ruler)
     check_context(prompts, max_tokens, ruler, MAX_TOKENS)
     rows = trained.prompt.rows
-    if isinstance(policy, TinyPolicy) and policy.single_calls:
+    if plays_episodes(policy):
         if not isinstance(exam, EpisodeExam):
             raise TrainerError(f"{model} was trained in episodes and writes no plans: pass --interactive")
         from embomatrix.trainer.evaluation.conversing import converse_in_episodes

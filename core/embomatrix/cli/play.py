@@ -70,10 +70,12 @@ class LoadedPolicy(NamedTuple):
     policy: "Policy"
     settings: "TrainSettings"
 
+    @property
+    def plays_episodes(self) -> bool:
+        """True if the policy was trained in episodes."""
+        from embomatrix.trainer.policy.tiny import plays_episodes
 
-def plays_episodes(policy: object) -> bool:
-    """Return True for a policy that was trained in episodes."""
-    return bool(getattr(policy, "single_calls", False))
+        return plays_episodes(self.policy)
 
 
 def play(
@@ -145,7 +147,7 @@ def play(
             _explore_by_hand(data.folder, record, seed)
             return
         trained = _load_policy(policy) if policy is not None else None
-        if trained is not None and plays_episodes(trained.policy):
+        if trained is not None and trained.plays_episodes:
             if film is not None or mode is PlayMode.PHYSICAL:
                 fail(f"{policy} plays episodes and writes no plans: leave out --film and --mode")
             _watch(trained, data.folder, record, seed)
@@ -270,9 +272,9 @@ def _watch(loaded: LoadedPolicy, folder: Path, record: TaskRecord, seed: int) ->
     from embomatrix.cli.play_by_policy import play_by_policy
     from embomatrix.skills.parse import plan_from_json
     from embomatrix.trainer.episodes.terms import EpisodeTerms
-    from embomatrix.trainer.policy.tiny import TinyPolicy
+    from embomatrix.trainer.policy.tiny import plays_episodes
 
-    assert isinstance(loaded.policy, TinyPolicy), "no other policy plays episodes"
+    assert plays_episodes(loaded.policy)
     terms = EpisodeTerms.of(loaded.settings.episodes)
     oracle = plan_from_json([*record.oracle], record.task.profile) if record.oracle else ()
     rules = EpisodeRules() if terms is None else terms.rules(oracle)

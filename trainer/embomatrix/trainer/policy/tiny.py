@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final, Self
+from typing import Final, Self, TypeGuard
 
 import torch
 from torch import Tensor, nn
@@ -342,6 +342,11 @@ class TinyPolicy:
     @staticmethod
     def is_saved_in(folder: Path) -> bool:
         return (folder / _DESCRIPTION).is_file()
+
+
+def plays_episodes(policy: object) -> TypeGuard[TinyPolicy]:
+    """Return True for a policy that was trained in episodes."""
+    return isinstance(policy, TinyPolicy) and policy.single_calls
 
 
 def _all_places(tokens: Tensor) -> Tensor:
