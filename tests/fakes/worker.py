@@ -34,7 +34,7 @@ from embomatrix.rpc.wire.values import (
     Timings,
 )
 from embomatrix.skills.trace import Step
-from embomatrix.skills.turns import TurnObservation
+from embomatrix.skills.turns import Advice, TurnObservation
 
 
 def completed(worker_id="w1", reward=PAPER, plan=(), holds=(True, False)):
@@ -59,7 +59,12 @@ def completed_turn(turn, worker_id="w1", reward=PAPER):
         steps=whole.steps[len(done) - len(further) :],
         trace_digest=f"sha256:{len(turn.plan)}",
         observation=TurnObservation(
-            "kitchen_0", (), (f"{len(turn.plan)} calls",), turn.sight, (0, 2) if turn.sight else ()
+            "kitchen_0",
+            (),
+            (f"{len(turn.plan)} calls",),
+            turn.sight,
+            (0, 2) if turn.sight else (),
+            Advice(turn.plan[:1]) if turn.advise else None,
         ),
     )
 
@@ -98,7 +103,7 @@ class FakeWorker:
     old: bool = False
     """True if it executes turns like other rollouts, as a worker does that does not know them."""
     blind: bool = False
-    """True if it does not say what the robot sees, as a worker does that does not know sight."""
+    """True if it says neither what the robot sees nor what the oracle advises, as a worker does that knows neither."""
     strange: bool = False
     """True if prefixes of turns have other digests here, as on another platform."""
     resumed: bool = False
@@ -258,7 +263,10 @@ class FakeWorker:
             mismatch = InfraFailure(InfraCode.PREFIX_MISMATCH, "expected a, found b", self.worker_id)
             self.report(lease.ref, mismatch, slot)
         elif lease.rollout.is_turn and not self.old:
-            turn = dataclasses.replace(lease.rollout, sight=lease.rollout.sight and not self.blind)
+            asked = lease.rollout
+            turn = dataclasses.replace(
+                asked, sight=asked.sight > self.blind, advise=asked.advise > self.blind
+            )
             self.report(lease.ref, completed_turn(turn, self.worker_id, lease.reward), slot)
         else:
             holds = (False, False) if self.lies else (True, False)

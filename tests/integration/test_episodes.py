@@ -13,11 +13,12 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.envs import EpisodeEnd, make
 from embomatrix.envs.turns import LocalEpisodes
+from embomatrix.reward.turns import Turn
 from embomatrix.rpc.episodes import Episodes
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.syntax import Skill, SkillCall
-from embomatrix.skills.turns import EpisodePrefix, PrefixMismatchError
+from embomatrix.skills.turns import Advice, EpisodePrefix, PrefixMismatchError
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.inflation import bundle_digest
 
@@ -53,10 +54,10 @@ def local_episodes():
     return LocalEpisodes(lambda digest: decode_bundle(DATA, digest=digest))
 
 
-async def played(episodes, seed, calls=20):
+async def played(episodes, seed, calls=20, *, asks=True):
     """Play an episode of random parts of the script, of which many calls fail, in turns of one to three calls.
 
-    Every second one has sight.
+    Every second one has sight, and every third one asks for advice after its turns.
     """
     draw = random.Random(seed)
     episode = episodes.begin(DIGEST, TASK.task_id, seed % 3, sight=seed % 2 == 1)
@@ -64,6 +65,8 @@ async def played(episodes, seed, calls=20):
     while len(episode.calls) < calls:
         at = draw.randrange(len(CALLS))
         turns.append(await episode.act(CALLS[at : at + draw.randint(1, 3)]))
+        if asks and seed % 3 == 0:
+            turns.append(await episode.advise())
     return turns, episode.calls, episode.prefix
 
 
@@ -74,7 +77,18 @@ async def test_episodes_of_a_cluster_equal_local_ones(tmp_path):
         near = [await played(local, seed) for seed in range(12)]
     assert far == near
     assert sum(len(prefix.failed) for _, _, prefix in near) > 40
-    assert any(turn.observation.held for turns, _, _ in near for turn in turns)
+    told = [turn for turns, _, _ in near for turn in turns]
+    assert any(turn.observation.held for turn in told if isinstance(turn, Turn))
+    advised = [turn for turn in told if isinstance(turn, Advice)]
+    assert any(advice.plan for advice in advised)
+
+
+async def test_asking_for_advice_changes_nothing_of_what_happens():
+    with local_episodes() as local:
+        for seed in (0, 3, 6):
+            asking, silent = await played(local, seed), await played(local, seed, asks=False)
+            assert [turn for turn in asking[0] if isinstance(turn, Turn)] == silent[0]
+            assert asking[1:] == silent[1:]
 
 
 async def test_worker_killed_between_two_turns_changes_nothing(tmp_path):
@@ -183,6 +197,19 @@ def test_first_example_of_the_page_plays_the_printed_episode():
     assert observations[-1].reward.tiers.success
     end, reward, conversation = names_of_the_page()["play"](lambda conversation: "done")
     assert (end, reward, len(conversation)) == (EpisodeEnd.DONE, -1.0, 4)
+
+
+def test_example_of_advice_is_a_plan_that_reaches_the_goal():
+    [(task_id, seed)] = re.findall(r"the shipped task `([^`]+)` .* with seed (\d+)", PAGE)
+    advised = names_of_the_page()["advised_after"]
+    before = ["go_to_room bedroom_0", "move 3", "pick_up 3"]
+    calls = advised(before, task_id).splitlines()
+    assert 0 < len(calls) < len(advised([], task_id).splitlines())
+    with make("starter") as environment:
+        environment.reset(task_id, seed=int(seed))
+        ends = [environment.step(answer) for answer in (*before, *calls)]
+    assert ends[-1].reward.tiers.success
+    assert advised([*before, *calls], task_id) == ""
 
 
 def test_example_of_the_readme_tells_of_the_kitchen(capsys):

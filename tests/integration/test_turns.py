@@ -36,7 +36,7 @@ from embomatrix.rpc.wire.values import (
     RunTerms,
 )
 from embomatrix.skills.syntax import Skill, SkillCall
-from embomatrix.skills.turns import EpisodePrefix, PrefixMismatchError
+from embomatrix.skills.turns import Advice, EpisodePrefix, PrefixMismatchError
 
 pytestmark = pytest.mark.timeout(90)
 
@@ -181,6 +181,22 @@ async def test_worker_that_does_not_know_sight_is_passed_over(tmp_path):
             (result,) = await client.step("r1", [looking])
         assert (result.outcome.worker_id, result.outcome.observation.sees) == ("new", (0, 2))
         assert result.outcome.steps == ()
+
+
+async def test_worker_that_does_not_know_advice_is_passed_over(tmp_path):
+    (asking,) = [dataclasses.replace(turn, advise=True) for turn in turns(1)]
+    async with (
+        manager(tmp_path) as at,
+        trainer(at.address) as client,
+        FakeWorker(at.address, "old", blind=True),
+    ):
+        (result,) = await client.step("r1", [asking])
+        assert result.outcome.code is InfraCode.VERSION_SKEW
+        assert "old does not know the oracle's advice in episodes: upgrade it" in result.outcome.message
+        async with FakeWorker(at.address, "new"):
+            (result,) = await client.step("r1", [asking])
+        assert result.outcome.worker_id == "new"
+        assert result.outcome.observation.advice == Advice(asking.plan[:1])
 
 
 async def test_worker_that_does_not_know_turns_is_passed_over(tmp_path):

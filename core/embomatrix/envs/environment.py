@@ -21,6 +21,7 @@ from embomatrix.world.dataset import SPLITS, Dataset, DatasetError
 
 if TYPE_CHECKING:
     from embomatrix.envs.simulation import Simulation
+    from embomatrix.skills.turns import Advice
     from embomatrix.world.dataset import TaskRecord
 
 T = TypeVar("T")
@@ -101,6 +102,14 @@ class Environment:
         """Take the policy's answer in the episode that ``reset`` began. Raises RuntimeError without one, or after its end."""
         (observation,) = self.answer([self._playing], [text])
         return observation
+
+    def advise(self) -> Advice:
+        """Ask the oracle for calls that reach the goal from here on, in the episode that ``reset`` began. Counts as no call.
+
+        The oracle sees the goal and the whole state, and may name rows that the policy has not seen. Raises RuntimeError
+        without an episode.
+        """
+        return self._wait(self._playing.player.advise())
 
     @property
     def _playing(self) -> PlayedEpisode:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.prompt import Prompt, Situation
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.trace import Step
+    from embomatrix.skills.turns import Advice
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +101,13 @@ class EpisodePlayer:
         told = self.observer.tell(steps, observed, self.reward.calls, notes)
         self.end = self._ending(done=done and all(step.ok for step in steps))
         return Observation(told, tuple(steps), self.reward, self.end)
+
+    async def advise(self) -> Advice:
+        """Ask the oracle for a plan from here on, which names objects that the policy may not have seen. Counts as no call.
+
+        Raises what ``RunningEpisode.advise`` raises.
+        """
+        return await self._running.advise()
 
     def stop(self, end: EpisodeEnd = EpisodeEnd.TOKENS) -> None:
         """End the episode from outside."""

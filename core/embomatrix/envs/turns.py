@@ -6,12 +6,13 @@ import asyncio
 import contextlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Self
 
 from embomatrix.reward.hierarchy import Fulfilment, judge, worth
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.reward.turns import EpisodeStart, RunningEpisode, Turn
+from embomatrix.sim.planner.oracle import advice_from_here
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.transitions import TransitionTree
 
@@ -72,7 +73,9 @@ class LocalEpisodes:
             while self._scenes:
                 stack.callback(self._scenes.popitem()[1].simulator.close)
 
-    async def _take_turn(self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix) -> Turn:
+    async def _take_turn(
+        self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix, *, advise: bool = False
+    ) -> Turn:
         await asyncio.sleep(0)  # other episodes take turns
         scene = self._scene(start.bundle_digest)
         tasks = scene.bundle.tasks
@@ -82,9 +85,13 @@ class LocalEpisodes:
             raise KeyError(f"{name}: expected one of its {len(tasks)} tasks")
         run, judgement, _ = scene.tree.execute_turn(task, plan, start.seed, prefix.length, sight=start.sight)
         prefix.check(run.steps[: prefix.length], run.prefix_digest)
+        observation = run.observation
+        if advise:
+            advice = scene.tree.after_turn(task, plan, start.seed, prefix.length, advice_from_here)
+            observation = replace(observation, advice=advice)
         return Turn(
             run.steps[prefix.length :],
-            run.observation,
+            observation,
             worth(task, run.touched, judgement, self._reward),
             run.digest,
         )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from embomatrix.skills.turns import EpisodePrefix, check_length
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.trace import Step
-    from embomatrix.skills.turns import TurnObservation
+    from embomatrix.skills.turns import Advice, TurnObservation
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +40,12 @@ class EpisodeStart:
     sight: bool = False
 
 
-TakeTurn = Callable[[EpisodeStart, "Plan", EpisodePrefix], Awaitable[Turn]]
-"""Executes the calls of a plan after its prefix."""
+class TakeTurn(Protocol):
+    """Executes the calls of a plan after its prefix. With ``advise``, the observation has the oracle's advice."""
+
+    def __call__(
+        self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix, *, advise: bool = False
+    ) -> Awaitable[Turn]: ...
 
 
 class RunningEpisode:
@@ -75,13 +79,24 @@ class RunningEpisode:
         check_length(self.calls, tuple(calls))
         return await self._take(tuple(calls))
 
-    async def _take(self, further: Plan) -> Turn:
+    async def advise(self) -> Advice:
+        """Ask the oracle, which sees the goal and the whole state, for a plan from the present state. Counts as no call.
+
+        Raises what ``act`` raises, and RuntimeError if there is no advice in the answer.
+        """
+        advice = (await self._take((), advise=True)).observation.advice
+        if advice is None:
+            raise RuntimeError("the turn was answered without advice: upgrade whatever executes it")
+        return advice
+
+    async def _take(self, further: Plan, *, advise: bool = False) -> Turn:
         if self._acting:
             raise RuntimeError("the episode is within a turn: await it before the next one")
-        check_length(self.calls, further, looks=self.start.sight)
+        check_length(self.calls, further, only_looks=self.start.sight or advise)
         self._acting = True
         try:
-            turn = await self._take_turn(self.start, (*self.calls, *further), self.prefix)
+            plan = (*self.calls, *further)
+            turn = await self._take_turn(self.start, plan, self.prefix, advise=advise)
         finally:
             self._acting = False
         self.calls = (*self.calls, *further[: len(turn.steps)])

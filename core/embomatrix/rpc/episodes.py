@@ -98,7 +98,9 @@ class Episodes:
         """
         return RunningEpisode(EpisodeStart(bundle_digest, task_id, seed, sight), self._take_turn)
 
-    async def _take_turn(self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix) -> Turn:
+    async def _take_turn(
+        self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix, *, advise: bool = False
+    ) -> Turn:
         name = str(next(self._numbers))
         rollout = Rollout(
             name,
@@ -109,6 +111,7 @@ class Episodes:
             start.seed,
             prefix=prefix,
             sight=start.sight,
+            advise=advise,
         )
         awaited = _AwaitedTurn(rollout, asyncio.get_running_loop().create_future())
         self._waiting.append(awaited)

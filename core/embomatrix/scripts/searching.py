@@ -102,6 +102,16 @@ class SearchingScript:
         used = {index for call in plan for index in (call.object_index, call.source_index)}
         return cls(plan, {row.index: row.category for row in situation.rows if row.index in used}, priors)
 
+    def take_over(self, known: Situation, steps: Iterable[Step]) -> None:
+        """Take in what was done before the script: it looks at no place a second time, unless that is closed."""
+        rows = {row.index: row for row in known.rows}
+        for step in steps:
+            row = rows.get(step.call.object_index) if step.call.object_index is not None else None
+            if step.ok and row is not None and "closed" not in row.states:
+                self._looked.add(row.name)
+            elif step.ok and step.call.room_name is not None:
+                self._looked.add(step.call.room_name)
+
     def next_call(self, known: Situation, last: Step | None) -> SkillCall | None:
         """Return the next call; None if the plan is done, or there is nowhere left to look.
 

@@ -26,6 +26,7 @@ NODES_KEPT: Final = 4_000
 """Nodes in memory, about 3 kB each."""
 
 T = TypeVar("T")
+R = TypeVar("R")
 _Key: TypeAlias = "str | SkillCall | tuple[SkillCall, int]"
 
 
@@ -114,6 +115,16 @@ class TransitionTree(Generic[T]):
         self._use(end)
         digests = first.digest(seed), last.digest(seed)
         return TurnRun(_steps_of(nodes), *digests, last.touched, observation), judgement, shared
+
+    def after_turn(
+        self, task: Task, plan: Plan, seed: int, prefix: int, ask: Callable[[Simulator, Task, int], R]
+    ) -> R:
+        """Return what ``ask`` says of the state after a turn, the task and the seed. It may leave the simulator anywhere."""
+        nodes, _ = self._walk(task, plan, seed, prefix, lambda _: None)
+        self._go_to(nodes[-1], task, seed)
+        self._use(nodes[-1])
+        self._here = None
+        return ask(self._simulator, task, seed)
 
     def _walk(
         self, task: Task, plan: Plan, seed: int, prefix: int, on_step: Callable[[int], None]

@@ -54,6 +54,16 @@ class EpisodePrefix:
 
 
 @dataclass(frozen=True, slots=True)
+class Advice:
+    """What the oracle, which sees the goal and the whole state, would do from here."""
+
+    plan: Plan = ()
+    """Calls that reach the goal; none if it holds, or if no plan was found."""
+    problem: str = ""
+    """Sentence about why no plan was found; empty if one was, or if the goal holds."""
+
+
+@dataclass(frozen=True, slots=True)
 class TurnObservation:
     """State that a turn leads to, in words. The outcome of each call is in the turn's steps."""
 
@@ -68,11 +78,13 @@ class TurnObservation:
     """True in episodes with sight: ``sees`` is set."""
     sees: tuple[int, ...] = ()
     """Rows of the task's table that the robot sees, rising."""
+    advice: Advice | None = None
+    """The oracle's advice, in a turn that asked for it. No part of what a policy is told."""
 
 
-def check_length(prefix: Plan, calls: Plan, *, looks: bool = False) -> None:
-    """Raise EpisodeOverError unless an episode may go on with these calls. A turn that ``looks`` may have none."""
-    if not calls and not looks:
+def check_length(prefix: Plan, calls: Plan, *, only_looks: bool = False) -> None:
+    """Raise EpisodeOverError unless an episode may go on with these calls. A turn that ``only_looks`` may have none."""
+    if not calls and not only_looks:
         raise EpisodeOverError("a turn has no call: expected at least one skill call")
     if len(prefix) + len(calls) > MAX_STEPS:
         raise EpisodeOverError(

@@ -118,6 +118,24 @@ def test_script_moves_and_repeats_a_call_that_failed_once():
     assert learned.next_call(everything, done(call(Skill.MOVE, 0))) == call(Skill.OPEN, 0)
 
 
+def test_script_that_takes_over_looks_nowhere_again_unless_it_is_closed():
+    home = ("bedroom_0", "hall_0", "kitchen_0")
+    to_bedroom = SkillCall(Skill.GO_TO_ROOM, room_name="bedroom_0")
+    opened = PromptRow(1, "cabinet_1", "cabinet", "kitchen_0", states=("open",), fixed=True)
+    known = situation(FRIDGE, opened, room="kitchen_0", home=home)
+    refused = Step(SkillCall(Skill.GO_TO_ROOM, room_name="hall_0"), "no_path", "there is no way")
+    before = [done(to_bedroom), done(call(Skill.MOVE, 0)), done(call(Skill.OPEN, 1)), refused]
+    learned = script()
+    learned.take_over(known, before)
+    asked = []
+    while (found := learned.next_call(known, None)) is not None:
+        asked.append(found)
+    rooms = {each.room_name for each in asked if each.skill is Skill.GO_TO_ROOM}
+    assert rooms == {"hall_0"}  # neither the bedroom, where it was, nor the kitchen, where it is
+    assert call(Skill.OPEN, 0) in asked
+    assert call(Skill.MOVE, 1) not in asked
+
+
 def test_script_gives_up_when_nowhere_is_left():
     learned = script()
     assert learned.next_call(situation(), None) is None

@@ -3,13 +3,21 @@
 from dataclasses import replace
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tests.fakes import furniture as make
 from tests.fakes.formulas import exists, forall, forn, forpairs
-from tests.fakes.plans import awkward_scene, task_over, with_objects, words_of
+from tests.fakes.plans import awkward_scene, plan_of, task_over, with_objects, words_of
 from tests.fakes.pose_caches import build_pose_cache
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks, placed, upright
 
-from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
+from embomatrix.sim.planner.oracle import (
+    PROOF_SEEDS,
+    PlanNotFound,
+    advice_from_here,
+    find_plan,
+    plan_from_here,
+)
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import MAX_STEPS, Skill
 from embomatrix.world.bundle import Bundle
@@ -423,3 +431,76 @@ def test_food_is_cooled_after_cooking_if_it_must_not_be_hot(flat):
 )
 def test_reason_names_the_obstacle_to_the_goal(flat, goal, reason):
     assert oracle(flat, goal) == reason
+
+
+GOALS = [
+    And((atom("inside", "apple_1", "fridge_1"), Not(atom("open", "fridge_1")))),
+    And((atom("ontop", "chicken_leg_1", "countertop_1"), atom("toggled_on", "table_lamp_1"))),
+    atom("hot", "apple_1", "microwave_1"),
+    atom("ontop", "mug_1", "breakfast_table_1"),
+]
+MISSTEPS = st.lists(
+    st.sampled_from(
+        [
+            "move apple_1",
+            "pick_up apple_1",
+            "move mug_1",
+            "pick_up mug_1",
+            "move fridge_1",
+            "open fridge_1",
+            "close fridge_1",
+            "pick_up chicken_leg_1",
+            "move microwave_1",
+            "open microwave_1",
+            "place microwave_1 inside",
+            "toggle_on microwave_1",
+            "move breakfast_table_1",
+            "place breakfast_table_1 ontop",
+            "toggle_on table_lamp_1",
+        ]
+    ),
+    max_size=10,
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(GOALS), MISSTEPS, st.integers(0, 3))
+def test_plan_from_any_state_reaches_the_goal(flat, goal, calls, seed):
+    task = task_over(flat.world.scene, goal)
+    flat.reset(task, seed)
+    for call in plan_of(task, "; ".join(calls)) if calls else ():
+        flat.run_step(call)
+    here, was_reached = flat.mark(), evaluate(goal, flat.facts, task.types)
+    found = plan_from_here(flat, task, seed)
+    assert isinstance(found, tuple), found
+    assert (found == ()) is was_reached
+    flat.return_to(here, seed)
+    assert plan_from_here(flat, task, seed) == found
+    flat.return_to(here, seed)
+    assert all(flat.run_step(call).ok for call in found)
+    assert evaluate(goal, flat.facts, task.types)
+
+
+def test_plan_from_here_carries_what_is_in_the_hand_to_its_place(flat):
+    task = task_over(flat.world.scene, atom("ontop", "apple_1", "countertop_1"))
+    flat.reset(task, 0)
+    for call in plan_of(task, "move apple_1; pick_up apple_1"):
+        flat.run_step(call)
+    assert words_of(plan_from_here(flat, task, 0), task) == "move countertop_1; place countertop_1 ontop"
+
+
+def test_plan_from_here_puts_down_what_it_does_not_need(flat):
+    task = task_over(flat.world.scene, atom("open", "fridge_1"))
+    flat.reset(task, 0)
+    for call in plan_of(task, "move apple_1; pick_up apple_1"):
+        flat.run_step(call)
+    found = words_of(plan_from_here(flat, task, 0), task)
+    assert found.startswith("place ") or "; place " in found
+    assert found.endswith("move fridge_1; open fridge_1")
+
+
+def test_advice_says_why_there_is_no_plan(flat):
+    task = task_over(flat.world.scene, atom("open", "apple_1"))
+    flat.reset(task, 0)
+    advice = advice_from_here(flat, task, 0)
+    assert (advice.plan, advice.problem) == ((), "apple_1 has no door, drawer or lid that opens")

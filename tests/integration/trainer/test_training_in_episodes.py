@@ -16,8 +16,10 @@ from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.data.tasks import load_tasks
+from embomatrix.trainer.episodes import teacher
 from embomatrix.trainer.episodes.client import ClusterEpisode
 from embomatrix.trainer.episodes.oracle import ORACLE_EPISODES
+from embomatrix.trainer.episodes.teacher import TAUGHT_EPISODES, Teacher, TeachingRules
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.evaluations import read_evaluations
@@ -63,7 +65,8 @@ def train(cluster, tasks, out, *, resume=False, **changes):
         newest = CheckpointStore(out / CHECKPOINTS, keep=9).latest()
         progress, settings = read_state(newest)
         policy = saved_policy(newest / "policy", settings)
-        reference = saved_policy(out / "reference", settings).frozen_copy()
+        is_there = (out / "reference").exists()
+        reference = saved_policy(out / "reference", settings).frozen_copy() if is_there else None
     else:
         policy, reference = new_policy(settings, tasks), None
     display = LineDisplay(Console(quiet=True))
@@ -110,7 +113,7 @@ def test_imitation_of_the_oracle_s_episodes_solves_the_training_tasks(cluster, t
     train(cluster, known, tmp_path / "run", **changes)
     episodes = json.loads((tmp_path / "run" / ORACLE_EPISODES).read_text())["episodes"]
     assert set(episodes) == {task.task.task_id for task in tasks.train}
-    assert all(turns[-1][0] == DONE for _, *turns in episodes.values())
+    assert all(turns[-1][0] == DONE for _, _, *turns in episodes.values())
     evaluation = read_evaluations(tmp_path / "run")[-1]
     assert all(answer.verdict.success for answer in evaluation.answers)
     assert json.loads(evaluation.answers[0].text)[-1] == DONE
@@ -153,6 +156,59 @@ def test_episodes_of_the_oracle_are_played_again_if_the_run_is_another(cluster, 
     told = json.loads(path.read_text())
     assert told["version"]["episodes"]["visibility"] == "full"
     assert "pick_up" in path.read_text()
+
+
+TAUGHT = {"episodes__teacher_rounds": 2, "episodes__teacher_episodes": 4, "grpo__steps": 1}
+
+
+def taught(out, number):
+    return json.loads((out / TAUGHT_EPISODES.format(number)).read_text())
+
+
+def test_oracle_finishes_what_the_policy_began_and_that_is_imitated(cluster, tasks, tmp_path, monkeypatch):
+    monkeypatch.setattr(teacher, "_TOGETHER", 2)
+    first = train(cluster, tasks, tmp_path / "one", **TAUGHT)
+    second = train(cluster, tasks, tmp_path / "two", processes=2, **TAUGHT)
+    untaught = train(cluster, tasks, tmp_path / "alone", grpo__steps=1)
+    assert torch.equal(weights(first), weights(second))
+    assert not torch.equal(weights(first), weights(untaught))
+    for number in (1, 2):
+        kept = taught(tmp_path / "one", number)
+        assert kept == taught(tmp_path / "two", number)
+        assert kept["version"]["teaching"]["round"] == number
+        episodes = kept["episodes"].values()
+        assert episodes  # each succeeded, whatever an untrained policy did before
+        assert any(begun for _, begun, *_ in episodes)
+        assert all(begun < len(turns) and turns[-1][0] == DONE for _, begun, *turns in episodes)
+    assert taught(tmp_path / "one", 1)["episodes"] != taught(tmp_path / "one", 2)["episodes"]
+
+
+def test_run_that_was_interrupted_in_a_round_of_teaching_goes_on_to_the_same_end(
+    cluster, tasks, tmp_path, monkeypatch
+):
+    whole = train(cluster, tasks, tmp_path / "whole", **TAUGHT)
+
+    def interrupted(self, number, planned):
+        if number == 2:
+            raise KeyboardInterrupt
+        return play(self, number, planned)
+
+    play = Teacher._play
+    with monkeypatch.context() as patch:
+        patch.setattr(Teacher, "_play", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            train(cluster, tasks, tmp_path / "halves", **TAUGHT)
+    assert not (tmp_path / "halves" / TAUGHT_EPISODES.format(2)).exists()
+    resumed = train(cluster, tasks, tmp_path / "halves", resume=True)
+    assert torch.equal(weights(whole), weights(resumed))
+
+
+def test_rounds_divide_imitation_into_equal_parts():
+    rules = TeachingRules.of(read_settings(None, {"episodes.teacher_rounds": 3}), None)
+    steps = 12
+    due = [rules.due(step / steps) for step in range(steps)]
+    assert due == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert TeachingRules.of(read_settings(None, {}), None).due(0.9) == 0
 
 
 def test_without_imitation_the_oracle_plays_nothing(cluster, tasks, tmp_path):

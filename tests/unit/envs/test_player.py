@@ -36,7 +36,7 @@ class Kitchen:
         self.executed = []
         self.opened = False
 
-    async def take_turn(self, start, plan, prefix):
+    async def take_turn(self, start, plan, prefix, *, advise=False):
         calls = plan[prefix.length :]
         self.executed += calls
         steps, changes, success = [], [], False

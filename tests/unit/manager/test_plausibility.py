@@ -14,7 +14,7 @@ from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.skills.trace import Step
-from embomatrix.skills.turns import EpisodePrefix
+from embomatrix.skills.turns import Advice, EpisodePrefix
 from embomatrix.world.task import MAX_TABLE
 
 PLAN = (SkillCall(Skill.MOVE, object_index=3), SkillCall(Skill.OPEN, object_index=4))
@@ -91,7 +91,17 @@ def sees(*rows):
     return dataclasses.replace(honest, observation=dataclasses.replace(honest.observation, sees=rows))
 
 
-@pytest.mark.parametrize("turn", [TURN, LOOK, dataclasses.replace(TURN, sight=True)])
+ASK = dataclasses.replace(TURN, plan=PLAN, advise=True)
+
+
+def advises(plan, problem=""):
+    honest = completed_turn(ASK)
+    return dataclasses.replace(
+        honest, observation=dataclasses.replace(honest.observation, advice=Advice(plan, problem))
+    )
+
+
+@pytest.mark.parametrize("turn", [TURN, LOOK, ASK, dataclasses.replace(TURN, sight=True)])
 def test_honest_turn_reports_the_steps_after_its_prefix(turn):
     assert contradiction(completed_turn(turn), turn, PAPER) == ""
 
@@ -121,6 +131,13 @@ def test_prefix_that_failed_earns_no_relevance():
         (sees(2, 1), LOOK, "no rising indices"),
         (sees(1, 1), LOOK, "no rising indices"),
         (sees(MAX_TABLE), LOOK, "no rising indices"),
+        (
+            completed_turn(ASK),
+            dataclasses.replace(ASK, advise=False, sight=False),
+            "its turn did not ask for it",
+        ),
+        (advises(PLAN * 33), ASK, "its advice has 66 calls"),
+        (advises(PLAN, "no way"), ASK, "its advice has 2 calls and the problem 'no way'"),
     ],
 )
 def test_impossible_turn_is_named(result, turn, reason):

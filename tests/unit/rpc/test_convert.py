@@ -37,7 +37,7 @@ from embomatrix.rpc.wire.values import (
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
-from embomatrix.skills.turns import EpisodePrefix, TurnObservation
+from embomatrix.skills.turns import Advice, EpisodePrefix, TurnObservation
 
 NEWER = bytes.fromhex("f80705")
 """Field 127, a varint, as a later version of the protocol may add it to a message."""
@@ -74,10 +74,11 @@ ROLLOUTS = st.builds(
     render=st.booleans(),
 )
 TURNS = st.builds(
-    lambda rollout, calls, failed, digest, sight: dataclasses.replace(
+    lambda rollout, calls, failed, digest, sight, advise: dataclasses.replace(
         rollout,
         plan=tuple(calls),
         sight=sight,
+        advise=advise,
         prefix=EpisodePrefix(
             len(calls) - 1, tuple(sorted(index for index in failed if index < len(calls) - 1)), digest
         ),
@@ -87,6 +88,7 @@ TURNS = st.builds(
     st.sets(st.integers(0, 4)),
     TEXTS,
     st.booleans(),
+    st.booleans(),
 )
 OBSERVATIONS = st.builds(
     TurnObservation,
@@ -95,6 +97,7 @@ OBSERVATIONS = st.builds(
     st.lists(TEXTS, max_size=3).map(tuple),
     st.booleans(),
     st.lists(UINT32, max_size=3).map(tuple),
+    st.none() | st.builds(Advice, st.lists(CALLS, max_size=3).map(tuple), TEXTS),
 )
 REWARDS = st.builds(
     RewardBreakdown,
@@ -191,14 +194,15 @@ def test_malformed_prefix_is_named(prefix, calls, problem):
     assert problem in str(caught.value)
 
 
-def test_turn_with_sight_may_have_no_further_call():
-    turn = Rollout("r", "g", "b", "t", (CALL,), 0, prefix=EpisodePrefix(1), sight=True)
+@pytest.mark.parametrize("field", ["sight", "advise"])
+def test_turn_that_only_looks_may_have_no_further_call(field):
+    turn = Rollout("r", "g", "b", "t", (CALL,), 0, prefix=EpisodePrefix(1), **{field: True})
     assert convert.turn_from_proto(_over_the_wire(convert.rollout_to_proto(turn))) == turn
     beyond = convert.rollout_to_proto(dataclasses.replace(turn, prefix=EpisodePrefix(2)))
     with pytest.raises(ConvertError, match=r"found 2 of 1 calls: expected no more than the plan has"):
         convert.turn_from_proto(beyond)
     no_turn = convert.rollout_to_proto(dataclasses.replace(turn, prefix=None))
-    with pytest.raises(ConvertError, match="sight: found it without a prefix"):
+    with pytest.raises(ConvertError, match=f"{field}: found it without a prefix"):
         convert.rollout_from_proto(no_turn)
 
 

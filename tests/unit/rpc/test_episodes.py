@@ -1,6 +1,7 @@
 """Episodes of a client: turns that are awaited together travel together, and errors reach the turn that they belong to."""
 
 import asyncio
+import dataclasses
 
 import pytest
 from tests.fakes.worker import completed_turn
@@ -11,7 +12,7 @@ from embomatrix.rpc.status import InvalidRequestError, NotFoundError, Overloaded
 from embomatrix.rpc.wire.bounds import TURNS
 from embomatrix.rpc.wire.values import Cancelled, InfraCode, InfraFailure, RolloutResult
 from embomatrix.skills.syntax import MAX_STEPS, Skill, SkillCall
-from embomatrix.skills.turns import EpisodeOverError, EpisodePrefix, PrefixMismatchError
+from embomatrix.skills.turns import Advice, EpisodeOverError, EpisodePrefix, PrefixMismatchError
 
 CALL = SkillCall(Skill.MOVE, object_index=1)
 LIMITS = ClientLimits(turn_s=5.0, retry_first_s=0.01, retry_longest_s=0.02)
@@ -88,6 +89,25 @@ async def test_episode_with_sight_looks_without_a_call():
     (look,), (act,) = client.calls
     assert (look.plan, look.prefix, look.sight) == ((), EpisodePrefix(), True)
     assert (act.plan, act.prefix, act.sight) == ((CALL,), EpisodePrefix(0, (), "sha256:0"), True)
+
+
+async def test_advice_takes_no_call_and_leaves_the_episode_as_it_was():
+    client = FakeClient()
+    async with Episodes(client, "run-1") as episodes:
+        episode = episodes.begin("sha256:0", "task")
+        await episode.act([CALL])
+        before = (episode.calls, episode.prefix)
+        assert await episode.advise() == Advice((CALL,))
+        assert (episode.calls, episode.prefix) == before
+    _, (asked,) = client.calls
+    assert (asked.plan, asked.prefix.length, asked.advise, asked.sight) == ((CALL,), 1, True, False)
+
+
+async def test_turn_that_is_answered_without_advice_is_an_error():
+    client = FakeClient(lambda turn: completed_turn(dataclasses.replace(turn, advise=False)))
+    async with Episodes(client, "run-1") as episodes:
+        with pytest.raises(RuntimeError, match="answered without advice: upgrade"):
+            await episodes.begin("sha256:0", "task").advise()
 
 
 async def test_turns_that_are_awaited_together_share_calls():

@@ -196,13 +196,30 @@ def test_what_the_policy_is_told_is_not_imitated():
     plan = (*call, *told, END)
     marks = (False,) * len(call) + (True,) * len(told) + (False,)
     example = ImitationExample(prompt, plan, marks)
-    assert plan_tokens([example]) == example.own == len(call) + 1
+    assert plan_tokens([example]) == example.imitated == len(call) + 1
     tokens = torch.tensor([plan])
     own = ~torch.tensor([marks])
     scored = POLICY.logprobs([prompt], tokens, own, 1, 1.0)
     loss = negative_log_likelihood(POLICY, [example]).item()
     assert loss == pytest.approx(-scored.logprobs[own].sum().item())
     assert scored.logprobs[~own].abs().sum().item() == 0
+
+
+def test_what_the_policy_began_is_not_imitated_and_counts_as_its_own():
+    prompt = prompts(POLICY, 1)[0]
+    call, told = POLICY.encode_plan(f"go_to_room {ROOM}"), POLICY.encode_told(TOLD[0])
+    plan = (*call, *told, *call, *told, END)
+    marks = ((False,) * len(call) + (True,) * len(told)) * 2 + (False,)
+    begun = len(call) + len(told)
+    whole, taught = ImitationExample(prompt, plan, marks), ImitationExample(prompt, plan, marks, begun)
+    assert (whole.imitated, taught.imitated) == (2 * len(call) + 1, len(call) + 1)
+    own = ~torch.tensor([marks])
+    scored = POLICY.logprobs([prompt], torch.tensor([plan]), own, 1, 1.0).logprobs[0]
+    losses = [negative_log_likelihood(POLICY, [example]).item() for example in (whole, taught)]
+    assert losses[0] == pytest.approx(-scored.sum().item())
+    assert losses[1] == pytest.approx(-scored[begun:].sum().item())
+    both = negative_log_likelihood(POLICY, [whole, taught]).item()
+    assert both == pytest.approx(sum(losses), rel=1e-5)
 
 
 def test_a_saved_policy_for_episodes_is_one_after_loading(tmp_path):

@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from types import SimpleNamespace
 
 import pytest
 from tests.fakes.symbolic_household import make_tasks
@@ -19,6 +20,7 @@ TASKS = make_tasks(3, 1)
 class LostEpisode:
     is_over = True
     opening = None
+    player = SimpleNamespace(steps=[])
     lost = InfraFailure(InfraCode.NO_CAPACITY, "no worker is connected: start one")
 
     def outcome(self):

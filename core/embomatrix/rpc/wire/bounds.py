@@ -141,6 +141,8 @@ BOUNDS: Final[Mapping[str, Bound]] = {
     "TurnObservation.held": Bound(length=RESULT_TEXT, count=HELD_LEASES),
     "TurnObservation.changes": Bound(length=RESULT_TEXT, count=MAX_TABLE + 1),
     "TurnObservation.sees": Bound(count=MAX_TABLE),
+    "Advice.plan": Bound(count=MAX_STEPS),
+    "Advice.problem": _RESULT_TEXT,
     "Reward.format": _REWARD,
     "Reward.relevance": _REWARD,
     "Reward.goal": _REWARD,

@@ -27,14 +27,23 @@ from embomatrix.rpc.wire.values import (
 )
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.trace import Step
-from embomatrix.skills.turns import TurnObservation
+from embomatrix.skills.turns import Advice, TurnObservation
 
 reward_to_proto, reward_from_proto = converters(
     RewardBreakdown,
     types_pb2.Reward,
     parts={"atoms": converters(AtomResult, types_pb2.AtomResult)},
 )
-_observation_to_proto, _observation_from_proto = converters(TurnObservation, types_pb2.TurnObservation)
+_observation_to_proto, _observation_from_proto = converters(
+    TurnObservation,
+    types_pb2.TurnObservation,
+    absent={"advice": None},
+    parts={
+        "advice": converters(
+            Advice, types_pb2.Advice, parts={"plan": (skill_call_to_proto, skill_call_from_proto)}
+        )
+    },
+)
 infra_failure_to_proto, infra_failure_from_proto = converters(
     InfraFailure,
     types_pb2.InfraFailure,

@@ -132,6 +132,7 @@ def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
     message.render = rollout.render
     message.also.extend(rollout.also)
     message.sight = rollout.sight
+    message.advise = rollout.advise
     if rollout.prefix is not None:
         message.prefix.SetInParent()
         message.prefix.MergeFrom(_prefix_to_proto(rollout.prefix))
@@ -159,6 +160,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         also=tuple(message.also),
         prefix=_prefix_in(message),
         sight=message.sight,
+        advise=message.advise,
     )
     _check_prefix(rollout)
     object.__setattr__(rollout, "wire", wire)
@@ -183,14 +185,15 @@ def _check_prefix(rollout: Rollout) -> None:
     """Raise ConvertError for a prefix that is not a part of the plan."""
     prefix = rollout.prefix
     if prefix is None:
-        if rollout.sight:
-            raise ConvertError("sight", "found it without a prefix: expected a turn of an episode")
+        for field in ("sight", "advise"):
+            if getattr(rollout, field):
+                raise ConvertError(field, "found it without a prefix: expected a turn of an episode")
         return
-    if prefix.length + (not rollout.sight) > len(rollout.plan):
+    if prefix.length + (not rollout.only_looks) > len(rollout.plan):
         expected = (
             "expected no more than the plan has"
-            if rollout.sight
-            else "expected fewer, since a turn without sight has a new call"
+            if rollout.only_looks
+            else "expected fewer, since a turn without sight or advice has a new call"
         )
         raise ConvertError("prefix.length", f"found {prefix.length} of {len(rollout.plan)} calls: {expected}")
     if any(index >= after for index, after in itertools.pairwise((*prefix.failed, prefix.length))):

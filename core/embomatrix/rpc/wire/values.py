@@ -54,7 +54,7 @@ class Rollout(_ReadWhenAsked):
     """One plan to execute once. The plans of one task in one batch share ``group_id`` and ``seed``."""
 
     _left = frozenset(
-        {"rollout_id", "group_id", "task_id", "plan", "seed", "render", "also", "prefix", "sight"}
+        {"rollout_id", "group_id", "task_id", "plan", "seed", "render", "also", "prefix", "sight", "advise"}
     )
 
     rollout_id: str
@@ -71,6 +71,8 @@ class Rollout(_ReadWhenAsked):
     """Calls of the plan that its episode has made before, if this is a turn of an episode."""
     sight: bool = False
     """The observation of this turn says what the robot sees. Such a turn may have no call after its prefix."""
+    advise: bool = False
+    """The observation of this turn has the oracle's advice. Such a turn may have no call after its prefix."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """Original message, which is passed on unchanged; a modified copy has none."""
     read: Reader | None = field(default=None, init=False, compare=False, repr=False)
@@ -84,6 +86,11 @@ class Rollout(_ReadWhenAsked):
     @property
     def is_turn(self) -> bool:
         return self.prefix is not None
+
+    @property
+    def only_looks(self) -> bool:
+        """True if the turn is useful without a new call."""
+        return self.sight or self.advise
 
 
 @dataclass(frozen=True, slots=True)

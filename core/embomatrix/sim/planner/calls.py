@@ -42,8 +42,8 @@ class PlanCalls:
     plan contains no move to an object that is already in reach.
     """
 
-    def __init__(self, simulator: Simulator, task: Task, seed: int, *, thrifty: bool = False) -> None:
-        simulator.reset(task, seed)
+    def __init__(self, simulator: Simulator, task: Task, *, thrifty: bool = False) -> None:
+        """Begin in the simulator's present state."""
         self._simulator = simulator
         self._world = simulator.world
         self._task = task

@@ -20,7 +20,8 @@ from embomatrix.sim.planner.script import PlanScript
 from embomatrix.sim.planner.subgoals import Exposure, PlacementGoal, Subgoals
 from embomatrix.sim.planner.tool_work import chosen_methods, needs_tools, subgoals_for
 from embomatrix.skills.prompt import plain_words
-from embomatrix.skills.syntax import Plan
+from embomatrix.skills.syntax import PlaceRelation, Plan
+from embomatrix.skills.turns import Advice
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Not
 from embomatrix.world.scene import Scene
@@ -30,6 +31,8 @@ from embomatrix.world.task import Task
 if TYPE_CHECKING:
     from embomatrix.sim.executor import Simulator
 
+PLACED: Final = frozenset({Relation.ONTOP, Relation.INSIDE, Relation.UNDER, Relation.NEXTTO})
+"""Relations that a call places an object in."""
 PROOF_SEEDS: Final = (0, 1, 2)
 """A plan must succeed with each of these seeds, so that it does not depend on luck."""
 SOURCES_TRIED: Final = 3
@@ -38,6 +41,8 @@ VARIANTS_TRIED: Final = 4
 """Variants to try for a relation."""
 ATTEMPTS: Final = 36
 """Most plans that are written for a task."""
+ATTEMPTS_FROM_HERE: Final = 8
+"""Most plans that are written from a state within an episode, while the episode waits."""
 ROUNDS: Final = 4
 """Most times that one attempt looks for missing literals and acts on them."""
 NAMED: Final = 2
@@ -76,15 +81,74 @@ def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
     simulator.reset(task, PROOF_SEEDS[0])
     if evaluate(task.goal, simulator.facts, task.types):
         return PlanNotFound("the goal holds at the start: there is nothing to do")
+    possible = _possible_choices(simulator, task)
+    return possible if isinstance(possible, PlanNotFound) else _first_proven(simulator, task, possible)
+
+
+def plan_from_here(simulator: Simulator, task: Task, seed: int) -> Plan | PlanNotFound:
+    """Return a plan that reaches the goal from the simulator's present state, or the reason why none was found.
+
+    The plan is empty if the goal holds. It succeeds with this seed. Leaves the state anywhere.
+    """
+    if evaluate(task.goal, simulator.facts, task.types):
+        return ()
+    possible = _possible_choices(simulator, task)
+    if isinstance(possible, PlanNotFound):
+        return possible
+    here, reason = simulator.mark(), ""
+    for choice, strategy in _attempts(possible)[:ATTEMPTS_FROM_HERE]:
+        simulator.return_to(here, seed)
+        script = PlanScript(simulator, task, choice)
+        try:
+            _empty_hand(simulator, task, choice, strategy, script)
+            _make_true(simulator, task, choice, strategy, script)
+        except StuckError as error:
+            reason = reason or str(error)
+            continue
+        # Failed calls and superfluous moves are left out, which changes random numbers: only the plan itself proves itself.
+        simulator.return_to(here, seed)
+        failed = next((step for call in script.plan if not (step := simulator.run_step(call)).ok), None)
+        if failed is None and evaluate(task.goal, simulator.facts, task.types):
+            return script.plan
+        reason = reason or (
+            f"{' '.join(map(_in_words, _missing(simulator, choice)))} is missing in the end"
+            if failed is None
+            else f"{failed.call.skill.value} fails: {failed.message}"
+        )
+    return PlanNotFound(reason)
+
+
+def advice_from_here(simulator: Simulator, task: Task, seed: int) -> Advice:
+    """Return what ``plan_from_here`` finds as advice. Leaves the state anywhere."""
+    found = plan_from_here(simulator, task, seed)
+    return Advice(problem=found.reason) if isinstance(found, PlanNotFound) else Advice(found)
+
+
+def _empty_hand(
+    simulator: Simulator, task: Task, choice: Choice, strategy: Strategy, script: PlanScript
+) -> None:
+    """Carry the held object to its place if it has one that takes it now, else to any surface. Raises StuckError."""
+    world = simulator.world
+    if not world.carried:
+        return
+    held = world.carried[0]
+    goals = [item for item in _placements(choice, strategy) if item.name == held]
+    reached = any(
+        script.deliver(item.target, PlaceRelation(item.relation)) for item in goals if item.relation in PLACED
+    )
+    if not reached:
+        script.put_down(frozenset())
+
+
+def _possible_choices(simulator: Simulator, task: Task) -> list[Choice] | PlanNotFound:
+    """Return the choices for a goal that does not hold, without those for which an obstacle is known."""
     obstacle = functools.cache(functools.partial(_obstacle, simulator, task))
     preference = functools.partial(naming_rank, task, simulator.world.scene)
     options = choices(task.goal, task.types, simulator.facts, preference, lambda item: bool(obstacle(item)))
     if not options:
         return PlanNotFound("the goal contradicts itself")
     possible = [choice for choice in options if not any(map(obstacle, choice))]
-    if not possible:
-        return PlanNotFound(next(filter(None, map(obstacle, options[0]))))
-    return _first_proven(simulator, task, possible)
+    return possible or PlanNotFound(next(filter(None, map(obstacle, options[0]))))
 
 
 def _obstacle(simulator: Simulator, task: Task, item: GroundLiteral) -> str:
@@ -170,13 +234,21 @@ def _short_enough(simulator: Simulator, task: Task, choice: Choice, strategy: St
 
 def _write(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy) -> Plan:
     """Make the literals true and return the calls. Raises StuckError."""
-    script = PlanScript(simulator, task, strategy.seed, choice, thrifty=strategy.thrifty)
+    simulator.reset(task, strategy.seed)
+    script = PlanScript(simulator, task, choice, thrifty=strategy.thrifty)
+    _make_true(simulator, task, choice, strategy, script)
+    return script.plan
+
+
+def _make_true(
+    simulator: Simulator, task: Task, choice: Choice, strategy: Strategy, script: PlanScript
+) -> None:
+    """Make the literals true by calls of the script. Raises StuckError."""
     for _ in range(ROUNDS):
         missing = _missing(simulator, choice)
         if not missing:
             break
         _subgoals(simulator, task, choice, missing, strategy).run(script, simulator)
-    return script.plan
 
 
 def _missing(simulator: Simulator, choice: Choice) -> list[GroundLiteral]:

@@ -34,10 +34,13 @@ class PlanScript:
     """One attempt at a task. Every routine raises StuckError if one of its calls fails without a remedy."""
 
     def __init__(
-        self, simulator: Simulator, task: Task, seed: int, choice: Choice = (), *, thrifty: bool = False
+        self, simulator: Simulator, task: Task, choice: Choice = (), *, thrifty: bool = False
     ) -> None:
-        """Start an attempt to make the literals of ``choice`` true. ``thrifty``: no moves to objects in reach."""
-        self._calls = PlanCalls(simulator, task, seed, thrifty=thrifty)
+        """Begin an attempt in the simulator's present state to make the literals of ``choice`` true.
+
+        ``thrifty``: no moves to objects in reach.
+        """
+        self._calls = PlanCalls(simulator, task, thrifty=thrifty)
         self._world = simulator.world
         self._task = task
         self._choice = choice
@@ -119,6 +122,10 @@ class PlanScript:
         """Pick an object up unless it is in the hand."""
         if name not in self._world.carried[:1]:
             self._take(name, 0)
+
+    def deliver(self, target: str, relation: PlaceRelation) -> bool:
+        """Carry the held object to its place, and return whether it is there now."""
+        return self._calls.place(target, relation).ok
 
     def put_down(self, avoid: frozenset[str]) -> None:
         """Place the held object on the first surface with room outside ``avoid``."""

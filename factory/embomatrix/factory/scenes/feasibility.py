@@ -93,7 +93,8 @@ class SimulatedRobot(CapableRobot):
         self, names: tuple[str, ...], goal: Formula | None, do: Callable[[PlanScript], None]
     ) -> bool:
         task = self._task_about(names)
-        script = PlanScript(self._simulator, task, SEED)
+        self._simulator.reset(task, SEED)
+        script = PlanScript(self._simulator, task)
         if goal is not None and evaluate(goal, self._simulator.facts, {}):
             return False
         try:

@@ -8,7 +8,7 @@ import itertools
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.wire.values import Completed, Rollout
-from embomatrix.skills.syntax import Plan
+from embomatrix.skills.syntax import MAX_STEPS, Plan
 from embomatrix.skills.trace import Step
 from embomatrix.world.task import MAX_TABLE
 
@@ -25,6 +25,7 @@ def contradiction(completed: Completed, rollout: Rollout, settings: RewardSettin
     before, plan = _split(rollout)
     return (
         _wrong_sight(completed, rollout)
+        or _wrong_advice(completed, rollout)
         or _wrong_steps(completed.steps, plan)
         or _wrong_reward(
             completed.reward, (*before, *(step.call for step in completed.steps if step.ok)), settings
@@ -40,6 +41,17 @@ def _wrong_sight(completed: Completed, rollout: Rollout) -> str:
         return "it says what the robot sees, and its turn is without sight"
     if any(row >= after for row, after in itertools.pairwise((*observation.sees, MAX_TABLE))):
         return "the rows that the robot sees are no rising indices of a table"
+    return ""
+
+
+def _wrong_advice(completed: Completed, rollout: Rollout) -> str:
+    advice = completed.observation.advice if completed.observation is not None else None
+    if advice is None:
+        return ""
+    if not rollout.advise:
+        return "it has the oracle's advice, and its turn did not ask for it"
+    if len(advice.plan) > MAX_STEPS or (advice.plan and advice.problem):
+        return f"its advice has {len(advice.plan)} calls and the problem {advice.problem[:100]!r}"
     return ""
 
 

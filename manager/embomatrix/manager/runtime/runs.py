@@ -323,7 +323,7 @@ def check_plans(batch: Batch, profiles: Mapping[str, Mapping[str, Profile]]) -> 
                 f"{name}: bundle {rollout.bundle_digest} has no task {rollout.task_id[:80]!r}: "
                 f"expected one of its {len(tasks)} tasks"
             )
-        if not rollout.plan and not rollout.sight:
+        if not rollout.plan and not rollout.only_looks:
             raise InvalidRequestError(f"{name} has an empty plan: expected at least one skill call")
         allowed = PROFILES[profile]
         for call in rollout.plan:

@@ -223,6 +223,7 @@ class Rollout(google.protobuf.message.Message):
     RENDER_FIELD_NUMBER: builtins.int
     PREFIX_FIELD_NUMBER: builtins.int
     SIGHT_FIELD_NUMBER: builtins.int
+    ADVISE_FIELD_NUMBER: builtins.int
     ALSO_FIELD_NUMBER: builtins.int
     rollout_id: builtins.str
     group_id: builtins.str
@@ -233,6 +234,8 @@ class Rollout(google.protobuf.message.Message):
     """Needs a slot that renders on a GPU."""
     sight: builtins.bool
     """The observation of this turn says what the robot sees. Such a turn may have no call after its prefix."""
+    advise: builtins.bool
+    """The observation of this turn has the oracle's advice. Such a turn may have no call after its prefix."""
     @property
     def plan(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SkillCall]: ...
     @property
@@ -255,10 +258,11 @@ class Rollout(google.protobuf.message.Message):
         render: builtins.bool = ...,
         prefix: Global___EpisodePrefix | None = ...,
         sight: builtins.bool = ...,
+        advise: builtins.bool = ...,
         also: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["prefix", b"prefix"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["also", b"also", "bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "prefix", b"prefix", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "sight", b"sight", "task_id", b"task_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["advise", b"advise", "also", b"also", "bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "prefix", b"prefix", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "sight", b"sight", "task_id", b"task_id"]) -> None: ...
 
 Global___Rollout: typing_extensions.TypeAlias = Rollout
 
@@ -339,6 +343,30 @@ class StepResult(google.protobuf.message.Message):
 Global___StepResult: typing_extensions.TypeAlias = StepResult
 
 @typing.final
+class Advice(google.protobuf.message.Message):
+    """What the oracle, which sees the goal and the whole state, would do from a state."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    PLAN_FIELD_NUMBER: builtins.int
+    PROBLEM_FIELD_NUMBER: builtins.int
+    problem: builtins.str
+    """Why no plan was found; empty if one was, or if the goal holds."""
+    @property
+    def plan(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SkillCall]:
+        """Calls that reach the goal; none if it holds, or if no plan was found."""
+
+    def __init__(
+        self,
+        *,
+        plan: collections.abc.Iterable[Global___SkillCall] | None = ...,
+        problem: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["plan", b"plan", "problem", b"problem"]) -> None: ...
+
+Global___Advice: typing_extensions.TypeAlias = Advice
+
+@typing.final
 class TurnObservation(google.protobuf.message.Message):
     """State that a turn leads to, in words."""
 
@@ -349,6 +377,7 @@ class TurnObservation(google.protobuf.message.Message):
     CHANGES_FIELD_NUMBER: builtins.int
     LOOKED_FIELD_NUMBER: builtins.int
     SEES_FIELD_NUMBER: builtins.int
+    ADVICE_FIELD_NUMBER: builtins.int
     room: builtins.str
     """Room of the robot; empty between rooms."""
     looked: builtins.bool
@@ -365,6 +394,10 @@ class TurnObservation(google.protobuf.message.Message):
     def sees(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
         """Rows of the task's table that the robot sees, rising."""
 
+    @property
+    def advice(self) -> Global___Advice:
+        """Set for a turn that asked for it."""
+
     def __init__(
         self,
         *,
@@ -373,8 +406,10 @@ class TurnObservation(google.protobuf.message.Message):
         changes: collections.abc.Iterable[builtins.str] | None = ...,
         looked: builtins.bool = ...,
         sees: collections.abc.Iterable[builtins.int] | None = ...,
+        advice: Global___Advice | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["changes", b"changes", "held", b"held", "looked", b"looked", "room", b"room", "sees", b"sees"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["advice", b"advice"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["advice", b"advice", "changes", b"changes", "held", b"held", "looked", b"looked", "room", b"room", "sees", b"sees"]) -> None: ...
 
 Global___TurnObservation: typing_extensions.TypeAlias = TurnObservation
 

@@ -101,6 +101,14 @@ def train(
             help="Train call by call instead of on whole plans. The policy is told of all objects, or of those it has seen.",
         ),
     ] = None,
+    teacher_rounds: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=100,
+            help="Rounds in which the oracle finishes episodes that the policy began (with --episodes). Default: 0.",
+        ),
+    ] = None,
     reward: _REWARD = None,
     threads: _THREADS = None,
     processes: _PROCESSES = None,
@@ -156,6 +164,7 @@ def train(
             "imitation.seconds": imitate_seconds,
             "imitation.steps": imitate_steps,
             "episodes.visibility": episodes,
+            "episodes.teacher_rounds": teacher_rounds,
             "evaluation.every": evaluate_every,
             "evaluation.tasks": evaluate_tasks,
             "track": track,

@@ -137,6 +137,12 @@ class EpisodesTable(_Frozen):
     """Subtracted from an episode's reward for each call."""
     failure_cost: float = Field(default=0.0, ge=0)
     """Subtracted from an episode's reward for each failed call, besides ``call_cost``."""
+    teacher_rounds: int = Field(default=0, ge=0, le=100)
+    """Rounds of teaching, at equal distances within imitation: the policy begins episodes, the oracle finishes them from
+    wherever that led, and what the oracle did is imitated from then on (DAgger, Ross et al. 2011).
+    """
+    teacher_episodes: int = Field(default=256, ge=1)
+    """Episodes of a round, each of another task, as far as there are so many."""
 
 
 class LoraSettings(_Frozen):

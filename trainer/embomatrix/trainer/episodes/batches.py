@@ -120,14 +120,14 @@ class _RunningBatch:
         self._waited_s = 0.0
 
     def advance(self) -> bool:
-        """Wait for what happened, and answer. Return False if every episode is over."""
+        """Wait for what happened, and answer. Return False once the policy answers in no episode any more."""
         if self._beginning is not None:
             self._begin(self._beginning)
             rows, told = [*range(len(self._episodes))], None
         else:
             assert self._told is not None
             rows, told = self._answered, self._wait(self._told)
-        going = [place for place, row in enumerate(rows) if not self._episodes[row].is_over]
+        going = [place for place, row in enumerate(rows) if self._episodes[row].is_for_policy]
         playing = [rows[place] for place in going]
         if not playing:
             return False
@@ -149,7 +149,13 @@ class _RunningBatch:
         for row, answer in zip(rows, answers, strict=True):
             if answer is None:
                 self._episodes[row].stop()
-        given = [(row, answer) for row, answer in zip(rows, answers, strict=True) if answer is not None]
+            elif answer in ("", DONE) and self._episodes[row].is_handed_over:
+                self._episodes[row].hand_over()
+        given = [
+            (row, answer)
+            for row, answer in zip(rows, answers, strict=True)
+            if answer is not None and self._episodes[row].is_for_policy
+        ]
         self._answered = [row for row, _ in given]
         episodes = [self._episodes[row] for row in self._answered]
         self._told = self._client.answer(episodes, [answer or DONE for _, answer in given])
@@ -166,6 +172,6 @@ class _RunningBatch:
             self._waited_s += time.monotonic() - began_s
 
     def result(self) -> PlayedBatch:
-        """Return the episodes, all of which are over."""
+        """Return the episodes, all of which are over or handed over."""
         samples = self._learner.end_episodes(self._batch.index)
         return PlayedBatch(self._batch, self._prompts, samples, tuple(self._episodes), self._waited_s)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from embomatrix.envs.player import EpisodePlayer
@@ -13,11 +13,13 @@ from embomatrix.envs.rules import EpisodeEnd
 from embomatrix.rpc.episodes import TurnFailedError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.skills.prompt import Codec, Prompt
+from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.skills.turns import PrefixMismatchError
 from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
 from embomatrix.trainer.episodes.terms import EpisodeTerms
 
 if TYPE_CHECKING:
+    from embomatrix.skills.turns import Advice
     from embomatrix.trainer.data.tasks import TrainingTask
 
 T = TypeVar("T")
@@ -25,26 +27,48 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class PlannedEpisode:
-    """Episode of a task that shall be played, and the seed of its simulation."""
+    """Episode of a task that shall be played, and the seed of its simulation.
+
+    If ``handover`` is given, the policy gives at most so many answers, and then another takes over. The budget of calls is
+    larger by as many.
+    """
 
     task: TrainingTask
     seed: int
+    handover: int | None = None
 
 
 class ClusterEpisode:
     """One episode on the cluster. ``opening`` is its first text, None if the infrastructure lost the episode before."""
 
-    def __init__(self, player: EpisodePlayer) -> None:
+    def __init__(self, player: EpisodePlayer, handover: int | None = None) -> None:
         self.player = player
         self.opening: Prompt | None = None
         self.answers: list[str] = []
-        """Answers of the policy so far."""
+        """Answers so far."""
+        self.told: list[str] = []
+        """What was told after each answer."""
         self.lost: InfraFailure | None = None
+        self._handover = handover
 
     @property
     def is_over(self) -> bool:
         """True if the episode takes no further answer."""
         return self.lost is not None or self.player.end is not None
+
+    @property
+    def is_for_policy(self) -> bool:
+        """True if the policy shall give the next answer."""
+        return not self.is_over and (self._handover is None or len(self.answers) < self._handover)
+
+    def hand_over(self) -> None:
+        """Let another give the next answer instead of the policy, which would end the episode."""
+        self._handover = len(self.answers)
+
+    @property
+    def is_handed_over(self) -> bool:
+        """True if another than the policy finishes the episode."""
+        return self._handover is not None
 
     def stop(self) -> None:
         """End the episode because the policy has no room for another answer."""
@@ -58,7 +82,12 @@ class ClusterEpisode:
         """Take an answer and return what the policy is told. Raises ClusterError if the manager can't be reached."""
         self.answers.append(text)
         observation = await self._try(lambda: self.player.answer(text))
-        return "" if observation is None else observation.text
+        self.told.append("" if observation is None else observation.text)
+        return self.told[-1]
+
+    async def advise(self) -> Advice | None:
+        """Ask the oracle what it would do from here on; None if the infrastructure lost the episode. Raises ClusterError."""
+        return await self._try(self.player.advise)
 
     async def _try(self, work: Callable[[], Awaitable[T]]) -> T | None:
         """Return the result of a turn. Without one the episode is lost, which says nothing about the policy."""
@@ -102,8 +131,9 @@ class EpisodeClient:
         for each in planned:
             running = await self._gateway.begin_episode(each.task, each.seed, sight=self._terms.sight)
             rules = self._terms.rules(each.task.oracle)
+            rules = replace(rules, calls=min(MAX_STEPS, rules.calls + (each.handover or 0)))
             player = EpisodePlayer(running, each.task.situation, rules, self._codec, self._gateway.reward)
-            episodes.append(ClusterEpisode(player))
+            episodes.append(ClusterEpisode(player, each.handover))
         await _all(episode.begin() for episode in episodes)
         return episodes
 

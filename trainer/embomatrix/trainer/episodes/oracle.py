@@ -41,36 +41,43 @@ _ATTEMPTS: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class OracleEpisode:
-    """Successful episode of a task: its opening, and the oracle's answers, each with what it was told then."""
+    """Successful episode of a task: its opening, and the answers, each with what was told then.
+
+    The policy gave the first ``begun`` answers, the oracle all others.
+    """
 
     opening: str
     turns: tuple[tuple[str, str], ...]
+    begun: int = 0
 
     def example(self, policy: TinyPolicy) -> ImitationExample:
-        """Return the episode's tokens. What the policy is told is not imitated."""
+        """Return the episode's tokens. Only the oracle's answers are imitated."""
         tokens: list[int] = []
         told: list[bool] = []
+        begun = 0
         for number, (answer, observation) in enumerate(self.turns, start=1):
             own = policy.encode_plan("" if answer == DONE else answer)
             after = policy.encode_told(observation) if number < len(self.turns) else ()
             tokens += (*own, *after)
             told += [False] * len(own) + [True] * len(after)
-        return ImitationExample(policy.encode(Prompt("", self.opening)), tuple(tokens), tuple(told))
+            if number == self.begun:
+                begun = len(tokens)
+        return ImitationExample(policy.encode(Prompt("", self.opening)), tuple(tokens), tuple(told), begun)
 
 
 class OracleExamples:
-    """Examples for imitation from oracle episodes: those of ``tasks`` that have one which fits the policy's context."""
+    """Examples for imitation from oracle episodes: those of ``tasks`` that have one which fits the policy's context.
+
+    A task may get further episodes, of which each is imitated as often as its first.
+    """
 
     def __init__(
         self, episodes: Mapping[str, OracleEpisode], policy: TinyPolicy, tasks: Sequence[TrainingTask]
     ) -> None:
         """Raises TrainerError if no task has one."""
-        examples = {name: episode.example(policy) for name, episode in episodes.items()}
-        self._examples = {
-            name: each
-            for name, each in examples.items()
-            if len(each.prompt) + len(each.plan) <= policy.context
-        }
+        self._policy = policy
+        self._examples: dict[str, list[ImitationExample]] = {}
+        self.add(episodes)
         self.tasks = tuple(task for task in tasks if task.task.task_id in self._examples)
         if not self.tasks:
             raise TrainerError(
@@ -78,13 +85,21 @@ class OracleExamples:
                 "--imitate-steps 0"
             )
 
+    def add(self, episodes: Mapping[str, OracleEpisode]) -> None:
+        """Add an episode for each of some tasks, as far as it fits the policy's context."""
+        for name, episode in episodes.items():
+            example = episode.example(self._policy)
+            if len(example.prompt) + len(example.plan) <= self._policy.context:
+                self._examples.setdefault(name, []).append(example)
+
     def example(self, task: TrainingTask, rng: np.random.Generator) -> ImitationExample:
-        """Return the task's episode. Episodes are not varied."""
-        return self._examples[task.task.task_id]
+        """Return one of the task's episodes. Episodes are not varied."""
+        episodes = self._examples[task.task.task_id]
+        return episodes[int(rng.integers(len(episodes)))] if len(episodes) > 1 else episodes[0]
 
     def plain_example(self, task: TrainingTask) -> ImitationExample:
-        """Return the task's episode."""
-        return self._examples[task.task.task_id]
+        """Return the task's first episode, in which the oracle gave all answers."""
+        return self._examples[task.task.task_id][0]
 
 
 @dataclass(slots=True)
@@ -109,10 +124,9 @@ def oracle_episodes(
     """
     path = folder / ORACLE_EPISODES
     version = {**identity, "format": FORMAT}
-    if path.exists():
-        kept_version, kept = read_episodes(path)
-        if kept_version == version:
-            return kept
+    known = kept_episodes(path, version)
+    if known is not None:
+        return known
     progress = _Progress()
     playing = client.run(_play_all(planned, client, progress))
     while not wait([playing], timeout=_REPORT_S).done:
@@ -131,8 +145,7 @@ def oracle_episodes(
         )
     in_order = [each.task.task.task_id for each in planned]
     kept = {task_id: progress.found[task_id] for task_id in in_order if task_id in progress.found}
-    rows = {task_id: [episode.opening, *episode.turns] for task_id, episode in kept.items()}
-    write_whole(path, json.dumps({"version": version, "episodes": rows}).encode("utf-8"))
+    write_episodes(path, version, kept)
     return kept
 
 
@@ -162,26 +175,48 @@ async def _play(
     task = planned.task
     for _ in range(_ATTEMPTS):
         [episode] = await client.begin_all([planned])
-        script = SearchingScript.of(task.oracle, task.situation, priors)
-        turns: list[tuple[str, str]] = []
-        while not episode.is_over:
-            answer = _answer(script, episode)
-            turns.append((answer, await episode.answer(answer)))
+        await finish(episode, SearchingScript.of(task.oracle, task.situation, priors))
         if episode.lost is None:
             break
     outcome = episode.outcome()
-    if outcome.success and episode.opening is not None:
-        progress.found[task.task.task_id] = OracleEpisode(episode.opening.user, tuple(turns))
+    found = successful(episode)
+    if found is not None:
+        progress.found[task.task.task_id] = found
     progress.outcomes.append(outcome)
     return outcome
 
 
-def _answer(script: SearchingScript, episode: ClusterEpisode) -> str:
-    """Return the script's next call in the policy's words."""
-    known = episode.player.observer.situation
+async def finish(episode: ClusterEpisode, script: SearchingScript) -> None:
+    """Give the script's answers, in the policy's words, until the episode is over. Raises ClusterError."""
     steps = episode.player.steps
-    call = script.next_call(known, steps[-1] if steps else None)
-    return DONE if call is None else plan_in_names((call,), known)
+    begun = len(steps)
+    while not episode.is_over:
+        known = episode.player.observer.situation
+        call = script.next_call(known, steps[-1] if len(steps) > begun else None)
+        await episode.answer(DONE if call is None else plan_in_names((call,), known))
+
+
+def successful(episode: ClusterEpisode, begun: int = 0) -> OracleEpisode | None:
+    """Return an episode that is over as one to imitate, None if it failed or was lost. The policy began ``begun`` answers."""
+    if not episode.outcome().success or episode.opening is None:
+        return None
+    return OracleEpisode(episode.opening.user, tuple(zip(episode.answers, episode.told, strict=True)), begun)
+
+
+def kept_episodes(path: Path, version: Mapping[str, object]) -> dict[str, OracleEpisode] | None:
+    """Read kept episodes; None if there is no file, or one of another version. Raises TrainerError if it is damaged."""
+    if not path.exists():
+        return None
+    found, episodes = read_episodes(path)
+    return episodes if found == version else None
+
+
+def write_episodes(path: Path, version: Mapping[str, object], episodes: Mapping[str, OracleEpisode]) -> None:
+    """Keep episodes by task, with what they depend on."""
+    rows = {
+        task_id: [episode.opening, episode.begun, *episode.turns] for task_id, episode in episodes.items()
+    }
+    write_whole(path, json.dumps({"version": version, "episodes": rows}).encode("utf-8"))
 
 
 def read_episodes(path: Path) -> tuple[dict[str, object], dict[str, OracleEpisode]]:
@@ -189,8 +224,8 @@ def read_episodes(path: Path) -> tuple[dict[str, object], dict[str, OracleEpisod
     try:
         value = parse_json(path.read_bytes())
         episodes = {
-            str(task_id): OracleEpisode(str(opening), tuple((str(a), str(b)) for a, b in turns))
-            for task_id, (opening, *turns) in value["episodes"].items()
+            str(task_id): OracleEpisode(str(opening), tuple((str(a), str(b)) for a, b in turns), int(begun))
+            for task_id, (opening, begun, *turns) in value["episodes"].items()
         }
         return dict(value["version"]), episodes
     except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:

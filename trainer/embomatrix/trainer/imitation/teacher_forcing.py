@@ -67,7 +67,8 @@ class Imitation:
         self._source = source
         self._settings = settings
         self._seed = seed
-        self._training, self._validation = _split_tasks(tasks, settings, seed)
+        # Other tasks are held back for validation.
+        self.training, self._validation = _split_tasks(tasks, settings, seed)
         self._gradient = GradientSum(policy, workers)
         self._optimiser = ImitationOptimiser(policy.module, settings)
         self._best: dict[str, Tensor] = {}
@@ -81,10 +82,13 @@ class Imitation:
         self._optimiser.load_state_dict(tensors["imitation"])
         self._best = dict(tensors["best"])
 
-    def run(self, report: Callable[[ImitationProgress], None]) -> None:
+    def run(
+        self, report: Callable[[ImitationProgress], None], prepare: Callable[[float], None] = lambda _: None
+    ) -> None:
         """Use up the rest of the budget. ``report`` is called after every step and may raise.
 
-        Ctrl-C is deferred while the weights change.
+        ``prepare`` is called before every step with the used share of the budget, and may raise and add examples. Ctrl-C is
+        deferred while the weights change.
         """
         state, earlier_s, began_s = self.state, self.state.seconds, time.monotonic()
         while not state.done:
@@ -93,6 +97,7 @@ class Imitation:
             if share >= 1.0 or self._should_stop():
                 self._finish()
                 return
+            prepare(share)
             with DeferredInterrupts() as interrupts:
                 loss = self._step(share, interrupts)
                 state.step += 1
@@ -130,8 +135,8 @@ class Imitation:
     def _step(self, share: float, interrupts: DeferredInterrupts) -> float:
         settings = self._settings
         rng = np.random.default_rng(np.random.SeedSequence((self._seed, 1, self.state.step)))
-        chosen = rng.integers(len(self._training), size=settings.batch)
-        examples = [self._source.example(self._training[int(at)], rng) for at in chosen]
+        chosen = rng.integers(len(self.training), size=settings.batch)
+        examples = [self._source.example(self.training[int(at)], rng) for at in chosen]
         loss = self._gradient.imitate(examples, settings.chunk or len(examples))
         torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
         interrupts.defer()

@@ -10,18 +10,20 @@ from embomatrix.trainer.policy.protocol import ImitationExample, Policy
 
 
 def plan_tokens(examples: Sequence[ImitationExample]) -> int:
-    """Return the number of tokens in the examples that a policy writes."""
-    return sum(example.own for example in examples)
+    """Return the number of tokens in the examples that are imitated."""
+    return sum(example.imitated for example in examples)
 
 
 def negative_log_likelihood(policy: Policy, examples: Sequence[ImitationExample]) -> Tensor:
-    """Return the negative log-likelihood of the plans in nats, summed over the tokens that a policy writes."""
-    prompts, plans, _ = zip(*examples, strict=True)
-    tokens = pad_sequence([torch.tensor(plan) for plan in plans], batch_first=True)
+    """Return the negative log-likelihood of the plans in nats, summed over the tokens that are imitated."""
+    tokens = pad_sequence([torch.tensor(example.plan) for example in examples], batch_first=True)
     mask = pad_sequence([_own(example) for example in examples], batch_first=True)
+    begun = torch.tensor([example.begun for example in examples])
+    imitated = torch.arange(tokens.shape[1]) >= begun[:, None]
     device = next(iter(policy.parameters())).device
+    prompts = [example.prompt for example in examples]
     scored = policy.logprobs(prompts, tokens.to(device), mask.to(device), group=1, temperature=1.0)
-    return -scored.logprobs.sum()
+    return -(scored.logprobs * imitated.to(device)).sum()
 
 
 def _own(example: ImitationExample) -> Tensor:

@@ -51,6 +51,9 @@ class LineDisplay:
     def played_oracle(self, count: int, total: int) -> None:
         self._print(f"{count} of {total} training tasks have an episode of the oracle to imitate")
 
+    def teaching(self, number: int, done: int, total: int) -> None:
+        self._show(f"round {number} of teaching", done / total, {"episodes": f"{done} of {total}"})
+
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._clock.note_evaluation(label, done, total, time.monotonic())
         self._show(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})

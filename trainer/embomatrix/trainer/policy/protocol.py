@@ -17,16 +17,20 @@ Tokens = tuple[int, ...]
 
 
 class ImitationExample(NamedTuple):
-    """Prompt and plan to imitate. ``told`` is true on tokens of the plan that the policy is told in an episode; empty: none."""
+    """Prompt and plan to imitate. ``told`` is true on tokens of the plan that the policy is told in an episode; empty: none.
+
+    The first ``begun`` tokens were written by the policy itself and are not imitated.
+    """
 
     prompt: Tokens
     plan: Tokens
     told: tuple[bool, ...] = ()
+    begun: int = 0
 
     @property
-    def own(self) -> int:
-        """Number of tokens that the policy writes."""
-        return len(self.plan) - sum(self.told)
+    def imitated(self) -> int:
+        """Number of tokens that are imitated."""
+        return len(self.plan) - self.begun - sum(self.told[self.begun :])
 
 
 @dataclass(frozen=True, slots=True)

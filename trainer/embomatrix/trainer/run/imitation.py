@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from embomatrix.trainer.episodes.oracle import OracleExamples
+from embomatrix.trainer.episodes.teacher import Teacher
 from embomatrix.trainer.imitation.teacher_forcing import Imitation, ImitationProgress
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, restore
@@ -25,10 +26,11 @@ def run_imitation(
     recorder: Recorder,
     report: Callable[[ImitationProgress], None],
     episodes: OracleExamples | None = None,
+    teacher: Teacher | None = None,
 ) -> None:
     """Use up the imitation budget and keep the progress current. A checkpoint is always left. Raises TrainerError.
 
-    ``episodes`` are imitated instead of plans, if they are given.
+    ``episodes`` are imitated instead of plans, if they are given, and those that a ``teacher`` adds to them.
     """
     policy, progress, settings = start.policy, start.progress, start.settings
     store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
@@ -59,8 +61,12 @@ def run_imitation(
             store.save(policy, imitation.tensors(), progress, settings)
             saved_s = time.monotonic()
 
+    def prepare(share: float) -> None:
+        if teacher is not None:
+            teacher.teach_if_due(share, imitation.training)
+
     try:
-        imitation.run(on_step)
+        imitation.run(on_step, prepare)
     finally:
         if state.step:
             store.save(policy, imitation.tensors(), progress, settings)

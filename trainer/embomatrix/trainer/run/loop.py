@@ -8,6 +8,7 @@ import logging
 import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from embomatrix.trainer.config.settings import SeedPer
 from embomatrix.trainer.data.tasks import Curriculum, Schedule
 from embomatrix.trainer.episodes.client import EpisodeClient, PlannedEpisode
 from embomatrix.trainer.episodes.oracle import OracleExamples, oracle_episodes
+from embomatrix.trainer.episodes.teacher import Teacher, TeachingRules
 from embomatrix.trainer.episodes.terms import EpisodeTerms
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.evaluation.held_out_episodes import evaluate_in_episodes
@@ -119,8 +121,10 @@ class TrainingRun:
             return EpisodeSampler(workers, start.policy, builder, self._gateway, settings, self._terms)
         return Sampler(workers, start.policy.codec, builder, self._gateway, settings, self._server)
 
-    def _oracle_examples(self) -> OracleExamples | None:
-        """Play or read the oracle's episodes, if the policy plays episodes and shall imitate."""
+    def _oracle_and_teacher(
+        self, workers: DataParallelWorkers
+    ) -> tuple[OracleExamples | None, Teacher | None]:
+        """Return examples of the oracle's episodes, played or read, and their teacher, if the policy shall imitate episodes."""
         start, terms, policy = self._start, self._terms, self._start.policy
         budget = self._settings.imitation
         has_budget = budget.seconds > 0 if budget.steps is None else budget.steps > 0
@@ -130,7 +134,7 @@ class TrainingRun:
             or not has_budget
             or self._progress.imitation.done
         ):
-            return None
+            return None, None
         planned = [
             PlannedEpisode(task, training_seed(self._settings.seed, task.task.task_id, 0))
             for task in start.tasks.train
@@ -139,13 +143,17 @@ class TrainingRun:
         identity = {
             "dataset": self._progress.dataset,
             "seed": self._settings.seed,
-            "episodes": self._settings.episodes.model_dump(mode="json"),
+            "episodes": asdict(
+                replace(terms, call_cost=0.0, failure_cost=0.0)
+            ),  # no costs: the oracle knows none
         }
         client = EpisodeClient(self._gateway, terms, policy.codec)
         episodes = oracle_episodes(self._out, identity, planned, client, self._display.playing_oracle)
         examples = OracleExamples(episodes, policy, start.tasks.train)
         self._display.played_oracle(len(examples.tasks), len(planned))
-        return examples
+        rules = TeachingRules.of(self._settings, terms)
+        report = self._display.teaching
+        return examples, Teacher(self._out, identity, rules, policy, workers, client, examples, report)
 
     def _load_tensors(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])
@@ -155,8 +163,14 @@ class TrainingRun:
         """Run imitation and the first evaluation, and save the reference policy."""
         policy, progress = self._start.policy, self._progress
         with self._stopwatch.track(Activity.IMITATION):
-            episodes = self._oracle_examples()
-            run_imitation(self._start, workers, self._out, self._recorder, self._display.imitation, episodes)
+            run_imitation(
+                self._start,
+                workers,
+                self._out,
+                self._recorder,
+                self._display.imitation,
+                *self._oracle_and_teacher(workers),
+            )
         self._publish()
         before = self._evaluate(BEFORE, self._settings.evaluation.samples, workers)
         progress.before = before.as_json() if before else []

@@ -6,6 +6,7 @@ The daemon starts it as ``python -m embomatrix.worker.slots.physics FD PARENT``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -18,6 +19,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import PreparedScene
+from embomatrix.sim.planner.oracle import advice_from_here
 from embomatrix.sim.transitions import TransitionTree
 from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
 from embomatrix.worker.slots.warm_up import PLAN, TIMES, WARM_UP, warm_up_bundle
@@ -25,7 +27,7 @@ from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_b
 from embomatrix.world.inflation import BundleError, bundle_digest
 
 if TYPE_CHECKING:
-    from embomatrix.skills.turns import EpisodePrefix
+    from embomatrix.skills.turns import Advice, EpisodePrefix
     from embomatrix.world.task import Task
 
 CLIENTS_PER_SCENE: Final = 2
@@ -138,6 +140,9 @@ class PhysicsScene:
             run = self._simulator.execute_turn(task, turn.plan, turn.seed, length, on_step, sight=turn.sight)
             judgement = judge(task, self._simulator.facts)
         prefix.check(run.steps[:length], run.prefix_digest)
+        observation = run.observation
+        if turn.advise:
+            observation = replace(observation, advice=self._advice(task, turn, length))
         return Completed(
             reward=worth(task, run.touched, judgement, reward),
             steps=run.steps[length:],
@@ -147,8 +152,14 @@ class PhysicsScene:
             timings=Timings(),
             warm=True,
             shared_steps=max(0, shared - length),
-            observation=run.observation,
+            observation=observation,
         )
+
+    def _advice(self, task: Task, turn: Rollout, length: int) -> Advice:
+        """Ask the oracle about the state after a turn that was just executed."""
+        if self._tree is not None:
+            return self._tree.after_turn(task, turn.plan, turn.seed, length, advice_from_here)
+        return advice_from_here(self._simulator, task, turn.seed)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,8 @@ def settle_result(state: DispatchState, event: LeaseFinished) -> None:
             _fail(state, lease, _outdated(event.worker_id, "turns of episodes"))
         case Completed(observation=TurnObservation(looked=False)) if lease.record.rollout.sight:
             _fail(state, lease, _outdated(event.worker_id, "sight in episodes"))
+        case Completed(observation=TurnObservation(advice=None)) if lease.record.rollout.advise:
+            _fail(state, lease, _outdated(event.worker_id, "the oracle's advice in episodes"))
         case Completed() as completed:
             wrong = contradiction(completed, lease.record.rollout, lease.record.reward)
             if wrong:
