@@ -133,7 +133,7 @@ def _import_report(data: bytes) -> object:
 
 
 def _oracle_episodes(data: bytes) -> object:
-    return read_episodes(in_file("run/oracle_episodes.json", data))
+    return read_episodes(in_file("run/oracle_episodes.json", data), {"seed": 0})
 
 
 def _outcome(data: bytes) -> object:
@@ -275,7 +275,8 @@ def table() -> dict[str, Decoder]:
             _oracle_episodes,
             (TrainerError,),
             lambda: (
-                b'{"version": {}, "episodes": {"task": ["room kitchen_0", ["open fridge", "did"], ["done", "robot"]]}}',
+                b'{"version": {"seed": 0, "format": 2, "file": 2}, "episodes": {"task": ["room kitchen_0", 1, ["open fridge", '
+                b'"did"], ["done", "robot"]]}}',
             ),
             frozenset({"trainer.episodes.oracle:read_episodes"}),
             mutate_json,

@@ -238,6 +238,12 @@ COMMANDS = (
         "plan of memory",
         "leave out episodes.visibility",
     ),
+    CommandCase(
+        "rounds of teaching without episodes",
+        "train --teacher-rounds=2 --dataset=KITCHEN --out=FILES/new",
+        "episodes.teacher_rounds",
+        "set episodes.visibility",
+    ),
     CommandCase("unknown visibility", "train --episodes=half --dataset=KITCHEN", "half", "full"),
     CommandCase("negative minutes", "train --minutes=-1", "--minutes", "greater than or equal to 0"),
     CommandCase("option without number", "train --steps=many", "--steps", "valid integer"),

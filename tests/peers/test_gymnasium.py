@@ -1,5 +1,7 @@
 """Gymnasium's environment checker, and the example of the docs."""
 
+import re
+
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.peers import EXAMPLES, PHYSICS, ROOT, Peer
@@ -75,7 +77,7 @@ except ValueError as error:
 PRINTED = """
 import pathlib, re, sys
 blocks = re.findall(r"```python\\n(.*?)```", pathlib.Path(sys.argv[2]).read_text(), re.DOTALL)
-(block,) = [text for text in blocks if "gymnasium" in text]
+block, _ = [text for text in blocks if "gymnasium" in text]
 known = {}
 exec(compile(block.replace("build/dataset", sys.argv[1]), "adapters.md", "exec"), known)
 print(known["observation"]["message"])
@@ -98,6 +100,17 @@ def test_environment_passes_gymnasiums_checker(peer, dataset):
 
 def test_example_of_the_page_runs(peer, dataset):
     assert peer.run("-c", PRINTED, dataset, ROOT / "docs" / "adapters.md").strip()
+
+
+def test_vector_example_of_the_page_runs(peer, dataset, tmp_path):
+    page = (ROOT / "docs" / "adapters.md").read_text(encoding="utf-8")
+    (block,) = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "make_vec" in each]
+    script = tmp_path / "vector.py"
+    printed = "    for message in observations['message']:\n        print(message)\n    envs.close()\n"
+    script.write_text(block.replace("build/dataset", str(dataset)) + printed)
+    messages = peer.run(script).splitlines()
+    assert len(messages) == 4
+    assert all(message.strip("0") for message in messages)
 
 
 def test_oracle_plans_reach_their_goals_and_a_random_agent_does_not(peer, dataset):

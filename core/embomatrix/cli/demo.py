@@ -52,6 +52,14 @@ def demo(
             help="Train call by call, told of all objects or of those seen. Takes longer than plans."
         ),
     ] = None,
+    teacher_rounds: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=100,
+            help="Rounds in which the oracle finishes episodes that the policy began (with --episodes). Default: 0.",
+        ),
+    ] = None,
     model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
     seed: Annotated[int, typer.Option(help="Random seed of policy and sampling.")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")] = 0,
@@ -88,6 +96,8 @@ def demo(
             options.append(f"--warn-after={max(0.0, minutes - (time.monotonic() - started_s) / 60)}")
         if episodes is not None:
             options.append(f"--episodes={episodes.value}")
+        if teacher_rounds is not None:
+            options.append(f"--teacher-rounds={teacher_rounds}")
         if threads:
             options.append(f"--threads={threads}")
         where = [f"--dataset={dataset}", f"--manager={cluster.address}", f"--out={folder}"]

@@ -82,11 +82,11 @@ class RunningEpisode:
     async def advise(self) -> Advice:
         """Ask the oracle, which sees the goal and the whole state, for a plan from the present state. Counts as no call.
 
-        Raises what ``act`` raises, and RuntimeError if there is no advice in the answer.
+        Raises what ``act`` raises, and RuntimeError if ``take_turn`` gives no advice.
         """
         advice = (await self._take((), advise=True)).observation.advice
         if advice is None:
-            raise RuntimeError("the turn was answered without advice: upgrade whatever executes it")
+            raise RuntimeError("the turn has no advice: expected it of every turn that asks")
         return advice
 
     async def _take(self, further: Plan, *, advise: bool = False) -> Turn:

@@ -116,7 +116,12 @@ class Episodes:
         awaited = _AwaitedTurn(rollout, asyncio.get_running_loop().create_future())
         self._waiting.append(awaited)
         self._gather()
-        return _turn_of(await awaited.outcome)
+        turn = _turn_of(await awaited.outcome)
+        if advise and turn.observation.advice is None:
+            raise TurnFailedError(
+                "the manager sent a turn without the oracle's advice: upgrade it and its workers"
+            )
+        return turn
 
     def _gather(self) -> None:
         """Send waiting turns soon, if a call may be made: those that are asked for meanwhile go with them."""

@@ -127,7 +127,7 @@ class SearchingScript:
         closing = self._close(rows, missing)
         if closing is not None:
             return closing
-        if not missing:
+        if not missing or (known.held and self._knows_until_placed(rows)):
             return self._carry_on(rows, last)
         places = sorted(self._places(known, missing), key=lambda place: (-place.worth, place.key))
         if not places:
@@ -146,6 +146,18 @@ class SearchingScript:
         if opened is None or "open" not in rows[opened].states or len(missing) < self._missing_before:
             return None
         return SkillCall(Skill.CLOSE, object_index=opened)
+
+    def _knows_until_placed(self, rows: Mapping[int, PromptRow]) -> bool:
+        """Return whether all rows are known that the plan names before it has placed what is in the hand.
+
+        Nothing opens with a full hand, so what is in it is placed before the search.
+        """
+        for call in self._plan:
+            if not {call.object_index, call.source_index} - {None} <= rows.keys():
+                return False
+            if call.skill is Skill.PLACE:
+                return True
+        return False
 
     def _carry_on(self, rows: Mapping[int, PromptRow], last: Step | None) -> SkillCall | None:
         """Return the plan's next call. A call that failed is made once more, after a move to its object."""
@@ -177,6 +189,8 @@ class SearchingScript:
             named = NAMED if f" {row.category.replace('_', ' ')} " in said else 1.0
             in_room = named * sum(self._priors.room(category, room_kind(row.room)) for category in wanted)
             if "closed" in row.states:
+                if known.held:
+                    continue
                 chance = sum(
                     self._priors.room(category, room_kind(row.room))
                     * self._priors.host(category, row.category)

@@ -1,5 +1,7 @@
 """Searches: tasks whose first look lacks something, found by a script that knows only what the robot has seen."""
 
+from dataclasses import replace
+
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
@@ -8,7 +10,7 @@ from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.search import evaluate_search, search_tasks, searches
 from embomatrix.scripts.searching import PlacePriors, SearchingScript, room_kind
 from embomatrix.skills.prompt import PromptRow, Situation
-from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.state import Relation
@@ -134,6 +136,28 @@ def test_script_that_takes_over_looks_nowhere_again_unless_it_is_closed():
     assert rooms == {"hall_0"}  # neither the bedroom, where it was, nor the kitchen, where it is
     assert call(Skill.OPEN, 0) in asked
     assert call(Skill.MOVE, 1) not in asked
+
+
+def test_script_with_a_full_hand_places_what_is_in_it_before_it_opens_anything():
+    cup = PromptRow(3, "cup_1", "cup", "kitchen_0")
+    table = PromptRow(4, "table_1", "table", "kitchen_0", fixed=True)
+    put = SkillCall(Skill.PLACE, object_index=4, relation=PlaceRelation.ONTOP)
+    plan = (call(Skill.MOVE, 4), put, *PLAN)
+    rows = {0: "fridge", 2: "milk", 4: "table"}
+    seen = replace(situation(FRIDGE, CABINET, cup, table), held=("cup_1",))
+    learned = SearchingScript(plan, rows, PlacePriors())
+    learned.take_over(seen, [])
+    assert [learned.next_call(seen, None) for _ in range(2)] == [call(Skill.MOVE, 4), put]
+    emptied = replace(seen, held=())
+    assert learned.next_call(emptied, done(put)).skill in (Skill.MOVE, Skill.OPEN)
+    # Where the place is unseen, it looks for that, but not into what it could not open.
+    far = replace(situation(FRIDGE, CABINET, cup, home=("den_0", "kitchen_0")), held=("cup_1",))
+    searching = SearchingScript(plan, rows, PlacePriors())
+    asked = []
+    while (found := searching.next_call(far, None)) is not None:
+        asked.append(found)
+    assert SkillCall(Skill.GO_TO_ROOM, room_name="den_0") in asked
+    assert all(each.skill is not Skill.OPEN for each in asked)
 
 
 def test_script_gives_up_when_nowhere_is_left():

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import shutil
+from collections import Counter
 from dataclasses import replace
 
 import pytest
@@ -175,9 +177,9 @@ def test_oracle_finishes_what_the_policy_began_and_that_is_imitated(cluster, tas
     for number in (1, 2):
         kept = taught(tmp_path / "one", number)
         assert kept == taught(tmp_path / "two", number)
-        assert kept["version"]["teaching"]["round"] == number
+        assert kept["version"]["round"] == number
         episodes = kept["episodes"].values()
-        assert episodes  # each succeeded, whatever an untrained policy did before
+        assert len(episodes) == min(4, len(tasks.train))  # whatever an untrained policy did before
         assert any(begun for _, begun, *_ in episodes)
         assert all(begun < len(turns) and turns[-1][0] == DONE for _, begun, *turns in episodes)
     assert taught(tmp_path / "one", 1)["episodes"] != taught(tmp_path / "one", 2)["episodes"]
@@ -203,8 +205,69 @@ def test_run_that_was_interrupted_in_a_round_of_teaching_goes_on_to_the_same_end
     assert torch.equal(weights(whole), weights(resumed))
 
 
+def test_run_that_was_killed_after_a_round_goes_on_with_the_kept_episodes(
+    cluster, tasks, tmp_path, monkeypatch
+):
+    whole = train(cluster, tasks, tmp_path / "whole", **TAUGHT)
+    before = taught(tmp_path / "whole", 1)
+    shutil.copytree(tmp_path / "whole", tmp_path / "killed")
+    shutil.rmtree(tmp_path / "killed" / CHECKPOINTS)
+    played = []
+    play = Teacher._play
+    monkeypatch.setattr(
+        Teacher, "_play", lambda self, number, planned: played.append(number) or play(self, number, planned)
+    )
+    again = train(cluster, tasks, tmp_path / "killed", **TAUGHT)
+    assert (played, taught(tmp_path / "killed", 1)) == ([], before)
+    assert torch.equal(weights(whole), weights(again))
+    train(cluster, tasks, tmp_path / "killed", tiny__inner=16, **TAUGHT)  # another policy
+    assert played == [1, 2]
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_episode_that_is_lost_while_the_oracle_finishes_it_is_begun_again(
+    cluster, tasks, tmp_path, monkeypatch, times
+):
+    train(cluster, tasks, tmp_path / "sound", **TAUGHT)
+    advise, asked = ClusterEpisode.advise, Counter()
+
+    async def lost_at_first(self):
+        name = self.player._running.start.task_id
+        asked[name] += 1
+        if asked[name] <= times:
+            self.lost = InfraFailure(InfraCode.VERSION_SKEW, "w1 does not know the oracle's advice")
+            return None
+        return await advise(self)
+
+    monkeypatch.setattr(ClusterEpisode, "advise", lost_at_first)
+    if times == 1:
+        train(cluster, tasks, tmp_path / "repaired", **TAUGHT)
+        assert taught(tmp_path / "repaired", 1) == taught(tmp_path / "sound", 1)
+    else:
+        with pytest.raises(TrainerError, match=r"round 1 .* was lost \(version_skew: w1 does not know"):
+            train(cluster, tasks, tmp_path / "lost", **TAUGHT)
+        assert not (tmp_path / "lost" / TAUGHT_EPISODES.format(1)).exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"imitation.steps": 2}, "fewer than the 2 steps of imitation"),
+        ({"imitation.steps": 0}, "fewer than the 0 steps"),
+        ({"imitation.seconds": 0}, "expected 0 without imitation"),
+        ({"imitation.patience": 3}, "expected imitation.patience = 0"),
+        ({"episodes.visibility": None}, "set episodes.visibility"),
+    ],
+)
+def test_rounds_that_teach_nothing_are_refused(changes, words):
+    asked = {"episodes.visibility": "seen", "episodes.teacher_rounds": 2}
+    with pytest.raises(TrainerError, match=words):
+        read_settings(None, {**asked, **changes})
+
+
 def test_rounds_divide_imitation_into_equal_parts():
-    rules = TeachingRules.of(read_settings(None, {"episodes.teacher_rounds": 3}), None)
+    settings = read_settings(None, {"episodes.visibility": "seen", "episodes.teacher_rounds": 3})
+    rules = TeachingRules.of(settings, None)
     steps = 12
     due = [rules.due(step / steps) for step in range(steps)]
     assert due == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]

@@ -137,6 +137,11 @@ def test_prefix_that_failed_earns_no_relevance():
             "its turn did not ask for it",
         ),
         (advises(PLAN * 33), ASK, "its advice has 66 calls"),
+        (
+            advises((dataclasses.replace(PLAN[0], object_index=MAX_TABLE),)),
+            ASK,
+            "names rows beyond any table",
+        ),
         (advises(PLAN, "no way"), ASK, "its advice has 2 calls and the problem 'no way'"),
     ],
 )

@@ -106,7 +106,7 @@ async def test_advice_takes_no_call_and_leaves_the_episode_as_it_was():
 async def test_turn_that_is_answered_without_advice_is_an_error():
     client = FakeClient(lambda turn: completed_turn(dataclasses.replace(turn, advise=False)))
     async with Episodes(client, "run-1") as episodes:
-        with pytest.raises(RuntimeError, match="answered without advice: upgrade"):
+        with pytest.raises(TurnFailedError, match="without the oracle's advice: upgrade"):
             await episodes.begin("sha256:0", "task").advise()
 
 

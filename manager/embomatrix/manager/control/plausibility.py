@@ -52,7 +52,12 @@ def _wrong_advice(completed: Completed, rollout: Rollout) -> str:
         return "it has the oracle's advice, and its turn did not ask for it"
     if len(advice.plan) > MAX_STEPS or (advice.plan and advice.problem):
         return f"its advice has {len(advice.plan)} calls and the problem {advice.problem[:100]!r}"
-    return ""
+    rows = {row for call in advice.plan for row in (call.object_index, call.source_index) if row is not None}
+    return (
+        "its advice names rows beyond any table"
+        if rows and not 0 <= min(rows) <= max(rows) < MAX_TABLE
+        else ""
+    )
 
 
 def _split(rollout: Rollout) -> tuple[Plan, Plan]:

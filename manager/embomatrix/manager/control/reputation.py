@@ -83,6 +83,7 @@ def opinion_of(worker_id: str, platform: Mapping[str, str], completed: Completed
     observation = completed.observation
     if observation is not None:
         texts += [observation.room, *observation.held, *observation.changes]
+        texts += [observation.advice.problem] if observation.advice is not None else []
     trace = (completed.trace_digest, _digest(observation), *tiers)
     return Opinion(worker_id, platform, trace, digest, sum(map(len, texts)))
 

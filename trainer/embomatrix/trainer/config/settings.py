@@ -144,6 +144,16 @@ class EpisodesTable(_Frozen):
     teacher_episodes: int = Field(default=256, ge=1)
     """Episodes of a round, each of another task, as far as there are so many."""
 
+    @field_validator("teacher_rounds")
+    @classmethod
+    def _check_rounds(cls, value: int, info: ValidationInfo) -> int:
+        if value and info.data.get("visibility", ...) is None:
+            raise ValueError(
+                "expected 0 without episodes, because the oracle takes over within them: set episodes.visibility "
+                "(--episodes), or leave it out"
+            )
+        return value
+
 
 class LoraSettings(_Frozen):
     """Low-rank adapters for a Hugging Face model. The model's own weights stay frozen."""
@@ -461,7 +471,30 @@ def checked_settings(values: Mapping[str, Any]) -> TrainSettings:
         settings = TrainSettings.model_validate(values)
     except ValidationError as error:
         raise settings_error(error) from error
+    _check_teaching(settings)
     return _with_server(settings) if settings.sampler.url else _without_server(settings)
+
+
+def _check_teaching(settings: TrainSettings) -> None:
+    """Raise TrainerError for rounds of teaching that imitation has no room for, or with early stopping."""
+    rounds, imitation = settings.episodes.teacher_rounds, settings.imitation
+    if not rounds:
+        return
+    if imitation.steps is not None and imitation.steps <= rounds:
+        raise TrainerError(
+            f"setting 'episodes.teacher_rounds': expected fewer than the {imitation.steps} steps of imitation, because "
+            f"at least one step belongs between two rounds: lower it, or raise imitation.steps (found {rounds})"
+        )
+    if imitation.steps is None and imitation.seconds == 0:
+        raise TrainerError(
+            "setting 'episodes.teacher_rounds': expected 0 without imitation, because its steps learn what is taught: leave it "
+            f"out, or raise imitation.seconds (found {rounds})"
+        )
+    if imitation.patience:
+        raise TrainerError(
+            "setting 'episodes.teacher_rounds': expected imitation.patience = 0 with it, because the validation loss knows the "
+            f"oracle's own episodes only: leave one of them out (found {imitation.patience})"
+        )
 
 
 def _with_server(settings: TrainSettings) -> TrainSettings:

@@ -149,7 +149,7 @@ class _RunningBatch:
         for row, answer in zip(rows, answers, strict=True):
             if answer is None:
                 self._episodes[row].stop()
-            elif answer in ("", DONE) and self._episodes[row].is_handed_over:
+            elif answer in ("", DONE) and self._episodes[row].has_handover:
                 self._episodes[row].hand_over()
         given = [
             (row, answer)

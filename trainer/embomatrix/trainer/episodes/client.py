@@ -30,7 +30,7 @@ class PlannedEpisode:
     """Episode of a task that shall be played, and the seed of its simulation.
 
     If ``handover`` is given, the policy gives at most so many answers, and then another takes over. The budget of calls is
-    larger by as many.
+    larger by as many, and equal failures do not end the episode.
     """
 
     task: TrainingTask
@@ -48,6 +48,8 @@ class ClusterEpisode:
         """Answers so far."""
         self.told: list[str] = []
         """What was told after each answer."""
+        self.begun = 0
+        """Answers of the policy before another took over."""
         self.lost: InfraFailure | None = None
         self._handover = handover
 
@@ -62,12 +64,12 @@ class ClusterEpisode:
         return not self.is_over and (self._handover is None or len(self.answers) < self._handover)
 
     def hand_over(self) -> None:
-        """Let another give the next answer instead of the policy, which would end the episode."""
+        """Let another give the next answer, because the policy would end the episode."""
         self._handover = len(self.answers)
 
     @property
-    def is_handed_over(self) -> bool:
-        """True if another than the policy finishes the episode."""
+    def has_handover(self) -> bool:
+        """True if another than the policy will finish the episode."""
         return self._handover is not None
 
     def stop(self) -> None:
@@ -131,7 +133,8 @@ class EpisodeClient:
         for each in planned:
             running = await self._gateway.begin_episode(each.task, each.seed, sight=self._terms.sight)
             rules = self._terms.rules(each.task.oracle)
-            rules = replace(rules, calls=min(MAX_STEPS, rules.calls + (each.handover or 0)))
+            if each.handover is not None:
+                rules = replace(rules, calls=min(MAX_STEPS, rules.calls + each.handover), equal_failures=0)
             player = EpisodePlayer(running, each.task.situation, rules, self._codec, self._gateway.reward)
             episodes.append(ClusterEpisode(player, each.handover))
         await _all(episode.begin() for episode in episodes)

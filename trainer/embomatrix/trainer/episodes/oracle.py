@@ -32,10 +32,12 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.tiny import TinyPolicy
 
 ORACLE_EPISODES: Final = "oracle_episodes.json"
+_FILE_VERSION: Final[Mapping[str, object]] = {"format": FORMAT, "file": 2}
+"""Versions of the texts of episodes, and of the files that keep them. Files of version 1 did not say who gave an answer."""
 _REPORT_S: Final = 0.5
 _SCENES: Final = 4
 """Scenes whose episodes are played at a time: with more, workers would load them again and again."""
-_ATTEMPTS: Final = 2
+ATTEMPTS: Final = 2
 """Times that an episode is played at most, if the infrastructure loses it."""
 
 
@@ -123,8 +125,7 @@ def oracle_episodes(
     episodes. Raises TrainerError if the cluster fails, no worker is there, or no episode succeeds.
     """
     path = folder / ORACLE_EPISODES
-    version = {**identity, "format": FORMAT}
-    known = kept_episodes(path, version)
+    known = read_episodes(path, identity)
     if known is not None:
         return known
     progress = _Progress()
@@ -145,7 +146,7 @@ def oracle_episodes(
         )
     in_order = [each.task.task.task_id for each in planned]
     kept = {task_id: progress.found[task_id] for task_id in in_order if task_id in progress.found}
-    write_episodes(path, version, kept)
+    write_episodes(path, identity, kept)
     return kept
 
 
@@ -173,7 +174,7 @@ async def _play(
 ) -> PlanOutcome:
     """Play the oracle's episode of a task, and keep it if it succeeds."""
     task = planned.task
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
         [episode] = await client.begin_all([planned])
         await finish(episode, SearchingScript.of(task.oracle, task.situation, priors))
         if episode.lost is None:
@@ -203,12 +204,22 @@ def successful(episode: ClusterEpisode, begun: int = 0) -> OracleEpisode | None:
     return OracleEpisode(episode.opening.user, tuple(zip(episode.answers, episode.told, strict=True)), begun)
 
 
-def kept_episodes(path: Path, version: Mapping[str, object]) -> dict[str, OracleEpisode] | None:
-    """Read kept episodes; None if there is no file, or one of another version. Raises TrainerError if it is damaged."""
+def read_episodes(path: Path, version: Mapping[str, object]) -> dict[str, OracleEpisode] | None:
+    """Read kept episodes by task; None if there are none of this version. Raises TrainerError if the file is damaged."""
     if not path.exists():
         return None
-    found, episodes = read_episodes(path)
-    return episodes if found == version else None
+    try:
+        value = parse_json(path.read_bytes())
+        if value["version"] != {**version, **_FILE_VERSION}:
+            return None
+        return {
+            str(task_id): OracleEpisode(str(opening), tuple((str(a), str(b)) for a, b in turns), int(begun))
+            for task_id, (opening, begun, *turns) in value["episodes"].items()
+        }
+    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
+        raise TrainerError(
+            f"{path} is damaged ({error}): remove it, and the episodes are played again"
+        ) from error
 
 
 def write_episodes(path: Path, version: Mapping[str, object], episodes: Mapping[str, OracleEpisode]) -> None:
@@ -216,19 +227,5 @@ def write_episodes(path: Path, version: Mapping[str, object], episodes: Mapping[
     rows = {
         task_id: [episode.opening, episode.begun, *episode.turns] for task_id, episode in episodes.items()
     }
-    write_whole(path, json.dumps({"version": version, "episodes": rows}).encode("utf-8"))
-
-
-def read_episodes(path: Path) -> tuple[dict[str, object], dict[str, OracleEpisode]]:
-    """Read kept episodes: what they depend on, and the episodes by task. Raises TrainerError if the file is damaged."""
-    try:
-        value = parse_json(path.read_bytes())
-        episodes = {
-            str(task_id): OracleEpisode(str(opening), tuple((str(a), str(b)) for a, b in turns), int(begun))
-            for task_id, (opening, begun, *turns) in value["episodes"].items()
-        }
-        return dict(value["version"]), episodes
-    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
-        raise TrainerError(
-            f"{path} is damaged ({error}): remove it, and the episodes are played again"
-        ) from error
+    content = {"version": {**version, **_FILE_VERSION}, "episodes": rows}
+    write_whole(path, json.dumps(content).encode("utf-8"))

@@ -1,13 +1,13 @@
 """Taught episodes: the policy begins, and the oracle finishes from wherever that led (DAgger: Ross et al. 2011).
 
-The oracle's episodes show states that good answers lead to. Those that the policy's own answers lead to, it would otherwise
-never see in imitation: a door left open, the wrong thing in the hand, a room searched twice.
+The oracle's own episodes show states that good answers lead to. Without teaching, imitation never shows those that the policy's
+answers lead to: a door left open, the wrong thing in the hand, a room searched twice.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -16,17 +16,17 @@ import numpy as np
 
 from embomatrix.rpc.status import ClusterError
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
-from embomatrix.skills.episode_text import FORMAT
 from embomatrix.skills.seeds import training_seed
 from embomatrix.trainer.cluster.gateway import refuse_without_workers, result_of
 from embomatrix.trainer.config.errors import TrainerError, first_of
 from embomatrix.trainer.episodes.batches import EpisodeBatch, play_batches
 from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, PlannedEpisode
 from embomatrix.trainer.episodes.oracle import (
+    ATTEMPTS,
     OracleEpisode,
     OracleExamples,
     finish,
-    kept_episodes,
+    read_episodes,
     successful,
     write_episodes,
 )
@@ -37,39 +37,34 @@ if TYPE_CHECKING:
     from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.episodes.terms import EpisodeTerms
     from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
+    from embomatrix.trainer.logging.display import LineDisplay
     from embomatrix.trainer.policy.tiny import TinyPolicy
 
 TAUGHT_EPISODES: Final = "taught_episodes_{}.json"
-_TOGETHER: Final = 64
-"""Episodes that are sampled together."""
+_TOGETHER: Final = 16
+"""Episodes that a learner samples together."""
+_EACH: Final = 2
+"""Such batches that each learner plays at a time. With more, workers would load the scenes again and again."""
 _STREAM: Final = 4
 """Part of the seed of a round's draws, which sets them apart from those of imitation."""
 
 
 @dataclass(frozen=True, slots=True)
 class TeachingRules:
-    """Rounds of teaching in a run: how many, their episodes, and the budgets of calls by the terms of the run's episodes."""
+    """Number of rounds and of their episodes, the terms of the episodes, and how the policy samples in them."""
 
     rounds: int
     episodes: int
     terms: EpisodeTerms
     sampling: SamplingRule
     seed: int
-    imitation: Mapping[str, object]
-    """Settings of imitation, which the policies of the rounds depend on."""
 
     @staticmethod
     def of(settings: TrainSettings, terms: EpisodeTerms) -> TeachingRules:
         """Return the rules that the settings of a run ask for."""
         table, grpo = settings.episodes, settings.grpo
-        return TeachingRules(
-            table.teacher_rounds,
-            table.teacher_episodes,
-            terms,
-            SamplingRule(1, grpo.temperature, grpo.max_new),
-            settings.seed,
-            {"model": settings.model, **settings.imitation.model_dump(mode="json")},
-        )
+        sampling = SamplingRule(1, grpo.temperature, grpo.max_new)
+        return TeachingRules(table.teacher_rounds, table.teacher_episodes, terms, sampling, settings.seed)
 
     def due(self, share: float) -> int:
         """Return the number of rounds that belong before this share of imitation. The rounds divide it into equal parts."""
@@ -79,29 +74,29 @@ class TeachingRules:
 class Teacher:
     """Rounds of teaching of one run, whose episodes are kept in its folder and added to its examples.
 
-    ``identity`` says what the episodes depend on, besides the policy. ``report`` gets the round, and finished and all
-    episodes. All sides of the cluster must know advice.
+    ``learned`` are the settings and data that the policy during imitation depends on: episodes that were kept with others are
+    played again. The manager and the workers must know advice; without it, a round ends with a TrainerError.
     """
 
     def __init__(
         self,
         folder: Path,
-        identity: Mapping[str, object],
+        learned: Mapping[str, object],
         rules: TeachingRules,
         policy: TinyPolicy,
         workers: DataParallelWorkers,
         client: EpisodeClient,
         examples: OracleExamples,
-        report: Callable[[int, int, int], None],
+        display: LineDisplay,
     ) -> None:
         self._folder = folder
-        self._identity = identity
+        self._learned = learned
         self._rules = rules
         self._policy = policy
         self._workers = workers
         self._client = client
         self._examples = examples
-        self._report = report
+        self._display = display
         self._priors = PlacePriors([task.situation for task in examples.tasks])
         self._done = 0
 
@@ -116,13 +111,14 @@ class Teacher:
 
     def _round(self, number: int, tasks: Sequence[TrainingTask]) -> dict[str, OracleEpisode]:
         path = self._folder / TAUGHT_EPISODES.format(number)
-        rules = self._rules
-        teaching = {"round": number, "rounds": rules.rounds, "episodes": rules.episodes, **rules.imitation}
-        version = {**self._identity, "format": FORMAT, "teaching": teaching}
-        known = kept_episodes(path, version)
+        temperature = self._rules.sampling.temperature
+        version = {"round": number, "temperature": temperature, "learned": dict(self._learned)}
+        known = read_episodes(path, version)
         if known is None:
-            known = self._play(number, self._planned(number, tasks))
+            planned = self._planned(number, tasks)
+            known = self._play(number, planned)
             write_episodes(path, version, known)
+            self._display.taught(number, len(known), len(planned))
         return known
 
     def _planned(self, number: int, tasks: Sequence[TrainingTask]) -> list[PlannedEpisode]:
@@ -141,56 +137,77 @@ class Teacher:
         ]
 
     def _play(self, number: int, planned: Sequence[PlannedEpisode]) -> dict[str, OracleEpisode]:
+        """Play the episodes of a round. Return those that succeed, by task. Raises TrainerError if all were lost."""
         found: dict[str, OracleEpisode] = {}
-        each = _TOGETHER * self._workers.count
-        for start in range(0, len(planned), each):
-            self._report(number, start, len(planned))
-            parts = range(start, min(start + each, len(planned)), _TOGETHER)
-            batches = [
-                EpisodeBatch(index, planned[at : at + _TOGETHER], _batch_seed(self._rules.seed, number, at))
-                for index, at in enumerate(parts)
-            ]
-            played = play_batches(batches, self._workers, self._client, self._policy, self._rules.sampling)
-            episodes = [
-                (task, episode)
-                for batch in played
-                for task, episode in zip(batch.batch.planned, batch.episodes, strict=True)
-            ]
-            refuse_without_workers(
-                [episode.outcome() for _, episode in episodes], f"round {number} of teaching"
-            )
-            found |= self._finish_all([(each.task, episode) for each, episode in episodes])
-        self._report(number, len(planned), len(planned))
+        lost = ""
+        size = _EACH * _TOGETHER * self._workers.count
+        for start in range(0, len(planned), size):
+            self._display.teaching(number, start, len(planned))
+            for task_id, episode in self._begin_and_finish(number, planned, range(start, start + size)):
+                taught = successful(episode, episode.begun)
+                if taught is not None:
+                    found[task_id] = taught
+                elif episode.lost is not None:
+                    lost = lost or f"{episode.lost.code}: {episode.lost.message}"
+        if lost and not found:
+            raise TrainerError(f"round {number} of teaching has no episode: the first was lost ({lost})")
         return found
 
-    def _finish_all(self, begun: Sequence[tuple[TrainingTask, ClusterEpisode]]) -> dict[str, OracleEpisode]:
-        """Let the oracle finish episodes that the policy has begun. Return those that succeed, by task."""
+    def _begin_and_finish(
+        self, number: int, planned: Sequence[PlannedEpisode], places: range
+    ) -> list[tuple[str, ClusterEpisode]]:
+        """Let the policy begin the episodes at these places, and the oracle finish them. Return them with their tasks."""
+        starts = places[::_TOGETHER]
+        batches = [
+            EpisodeBatch(index, part, _batch_seed(self._rules.seed, number, start))
+            for index, start in enumerate(starts)
+            if (part := planned[start : start + _TOGETHER])
+        ]
+        played = play_batches(batches, self._workers, self._client, self._policy, self._rules.sampling)
+        begun = [
+            (each, episode)
+            for batch in played
+            for each, episode in zip(batch.batch.planned, batch.episodes, strict=True)
+        ]
         try:
-            finished = result_of(self._client.run(self._finish_side_by_side(begun)))
+            finished = result_of(self._client.run(self._finish_all(begun)))
         except ExceptionGroup as errors:
             first = first_of(errors)
             raise (TrainerError(str(first)) if isinstance(first, ClusterError) else first) from errors
-        pairs = zip(begun, finished, strict=True)
-        return {task.task.task_id: episode for (task, _), episode in pairs if episode is not None}
+        refuse_without_workers([each.outcome() for each in finished], f"round {number} of teaching")
+        return [(each.task.task.task_id, end) for (each, _), end in zip(begun, finished, strict=True)]
 
-    async def _finish_side_by_side(
-        self, begun: Sequence[tuple[TrainingTask, ClusterEpisode]]
-    ) -> list[OracleEpisode | None]:
+    async def _finish_all(
+        self, begun: Sequence[tuple[PlannedEpisode, ClusterEpisode]]
+    ) -> list[ClusterEpisode]:
         async with asyncio.TaskGroup() as group:
-            finishing = [group.create_task(self._finish(task, episode)) for task, episode in begun]
+            finishing = [group.create_task(self._finish(each, episode)) for each, episode in begun]
         return [each.result() for each in finishing]
 
-    async def _finish(self, task: TrainingTask, episode: ClusterEpisode) -> OracleEpisode | None:
+    async def _finish(self, planned: PlannedEpisode, episode: ClusterEpisode) -> ClusterEpisode:
+        """Let the oracle finish an episode. One that the infrastructure loses is begun again with the policy's answers."""
+        answers = tuple(episode.answers)
+        for attempt in range(ATTEMPTS):
+            if attempt:
+                [episode] = await self._client.begin_all([planned])
+                for answer in answers:
+                    if not episode.is_over:
+                        await episode.answer(answer)
+            await self._finish_once(planned.task, episode)
+            if episode.lost is None:
+                break
+        return episode
+
+    async def _finish_once(self, task: TrainingTask, episode: ClusterEpisode) -> None:
         if episode.is_over:
-            return None
-        by_policy = len(episode.answers)
+            return
+        episode.begun = len(episode.answers)
         advice = await episode.advise()
         if advice is None or advice.problem:
-            return None
+            return
         script = SearchingScript.of(advice.plan, task.situation, self._priors)
         script.take_over(episode.player.observer.situation, episode.player.steps)
         await finish(episode, script)
-        return successful(episode, by_policy)
 
 
 def _batch_seed(seed: int, number: int, at: int) -> int:

@@ -87,8 +87,8 @@ class Imitation:
     ) -> None:
         """Use up the rest of the budget. ``report`` is called after every step and may raise.
 
-        ``prepare`` is called before every step with the used share of the budget, and may raise and add examples. Ctrl-C is
-        deferred while the weights change.
+        ``prepare`` is called before every step with the used share of the budget, and may raise and add examples; its time is
+        not part of the budget. Ctrl-C is deferred while the weights change.
         """
         state, earlier_s, began_s = self.state, self.state.seconds, time.monotonic()
         while not state.done:
@@ -97,7 +97,9 @@ class Imitation:
             if share >= 1.0 or self._should_stop():
                 self._finish()
                 return
+            paused_s = time.monotonic()
             prepare(share)
+            began_s += time.monotonic() - paused_s
             with DeferredInterrupts() as interrupts:
                 loss = self._step(share, interrupts)
                 state.step += 1

@@ -54,6 +54,11 @@ class LineDisplay:
     def teaching(self, number: int, done: int, total: int) -> None:
         self._show(f"round {number} of teaching", done / total, {"episodes": f"{done} of {total}"})
 
+    def taught(self, number: int, count: int, total: int) -> None:
+        self._print(
+            f"round {number} of teaching: the oracle finished {count} of {total} episodes with success"
+        )
+
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._clock.note_evaluation(label, done, total, time.monotonic())
         self._show(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})

@@ -41,7 +41,7 @@ from embomatrix.trainer.logging.report import REPORT, TrainedOn, TrainingSummary
 from embomatrix.trainer.logging.trackers import Tracker
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.run.imitation import run_imitation
-from embomatrix.trainer.run.starting import REFERENCE, RunStart
+from embomatrix.trainer.run.starting import REFERENCE, RunStart, imitation_identity
 from embomatrix.trainer.serving.sampler import ServerSampler
 
 if TYPE_CHECKING:
@@ -140,20 +140,19 @@ class TrainingRun:
             for task in start.tasks.train
             if task.oracle
         ]
+        without_costs = replace(terms, call_cost=0.0, failure_cost=0.0)  # the oracle does not mind them
         identity = {
             "dataset": self._progress.dataset,
             "seed": self._settings.seed,
-            "episodes": asdict(
-                replace(terms, call_cost=0.0, failure_cost=0.0)
-            ),  # no costs: the oracle knows none
+            "episodes": asdict(without_costs),
         }
         client = EpisodeClient(self._gateway, terms, policy.codec)
         episodes = oracle_episodes(self._out, identity, planned, client, self._display.playing_oracle)
         examples = OracleExamples(episodes, policy, start.tasks.train)
         self._display.played_oracle(len(examples.tasks), len(planned))
         rules = TeachingRules.of(self._settings, terms)
-        report = self._display.teaching
-        return examples, Teacher(self._out, identity, rules, policy, workers, client, examples, report)
+        learned = {"dataset": self._progress.dataset, **imitation_identity(self._settings)}
+        return examples, Teacher(self._out, learned, rules, policy, workers, client, examples, self._display)
 
     def _load_tensors(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])

@@ -247,6 +247,16 @@ def _check_unchanged(out: Path, original: TrainSettings, now: TrainSettings, *, 
             )
 
 
+def imitation_identity(settings: TrainSettings) -> dict[str, Any]:
+    """Return the settings, by dotted names, that the policy during imitation depends on."""
+    flat = _flat(settings.model_dump(mode="json"))
+    return {
+        name: value
+        for name, value in flat.items()
+        if name not in CHANGEABLE and not name.startswith(AFTER_IMITATION)
+    }
+
+
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Flatten nested settings to dotted keys."""
     flat: dict[str, Any] = {}
