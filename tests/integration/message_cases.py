@@ -244,6 +244,12 @@ COMMANDS = (
         "episodes.teacher_rounds",
         "set episodes.visibility",
     ),
+    CommandCase(
+        "more rounds of teaching than steps of imitation",
+        "train --episodes=seen --teacher-rounds=9 --imitate-steps=9 --dataset=KITCHEN --out=FILES/new",
+        "the 9 steps of imitation",
+        "lower it",
+    ),
     CommandCase("unknown visibility", "train --episodes=half --dataset=KITCHEN", "half", "full"),
     CommandCase("negative minutes", "train --minutes=-1", "--minutes", "greater than or equal to 0"),
     CommandCase("option without number", "train --steps=many", "--steps", "valid integer"),
