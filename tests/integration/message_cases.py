@@ -227,10 +227,10 @@ COMMANDS = (
         "leave out episodes.visibility",
     ),
     CommandCase(
-        "language model in episodes",
-        "train --model=some/model --episodes=seen --dataset=KITCHEN --out=FILES/new",
-        "episodes.visibility",
-        "pass --model tiny",
+        "model server in episodes",
+        "train --model=some/model --episodes=seen --sampler-url=http://127.0.0.1:9 --dataset=KITCHEN --out=FILES/new",
+        "sampler.url",
+        "leave it or episodes.visibility out",
     ),
     CommandCase(
         "memory of episodes",

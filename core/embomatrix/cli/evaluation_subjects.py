@@ -66,7 +66,7 @@ class Subject:
 def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
     """Load the model. Raises TrainerError."""
     from embomatrix.trainer.evaluation.models import load_model
-    from embomatrix.trainer.policy.tiny import plays_episodes
+    from embomatrix.trainer.policy.playing import plays_episodes
 
     policy, trained = load_model(model, settings.codec, threads=settings.threads, device=settings.device)
     if isinstance(exam, NativeExam) and policy.codec is Codec.NAMES:
@@ -75,10 +75,12 @@ def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
         )
     ruler = Ruler.of_policy(policy)
     prompts = {each.task_id: each.prompt for each in exam.questions(policy.codec, trained.prompt.rows)}
-    max_tokens = settings.max_tokens or room_for(trained.grpo.max_new, prompts, ruler)
+    in_episodes = plays_episodes(policy)
+    room = trained.episodes.answer_tokens if in_episodes else room_for(trained.grpo.max_new, prompts, ruler)
+    max_tokens = settings.max_tokens or room
     check_context(prompts, max_tokens, ruler, MAX_TOKENS)
     rows = trained.prompt.rows
-    if plays_episodes(policy):
+    if in_episodes:
         if not isinstance(exam, EpisodeExam):
             raise TrainerError(f"{model} was trained in episodes and writes no plans: pass --interactive")
         from embomatrix.trainer.evaluation.conversing import converse_in_episodes

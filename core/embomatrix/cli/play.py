@@ -73,7 +73,7 @@ class LoadedPolicy(NamedTuple):
     @property
     def plays_episodes(self) -> bool:
         """True if the policy was trained in episodes."""
-        from embomatrix.trainer.policy.tiny import plays_episodes
+        from embomatrix.trainer.policy.playing import plays_episodes
 
         return plays_episodes(self.policy)
 
@@ -272,14 +272,15 @@ def _watch(loaded: LoadedPolicy, folder: Path, record: TaskRecord, seed: int) ->
     from embomatrix.cli.play_by_policy import play_by_policy
     from embomatrix.skills.parse import plan_from_json
     from embomatrix.trainer.episodes.terms import EpisodeTerms
-    from embomatrix.trainer.policy.tiny import plays_episodes
 
-    assert plays_episodes(loaded.policy)
     terms = EpisodeTerms.of(loaded.settings.episodes)
     oracle = plan_from_json([*record.oracle], record.task.profile) if record.oracle else ()
     rules = EpisodeRules() if terms is None else terms.rules(oracle)
-    with make(folder, split=record.split, rules=rules, codec=Codec.NAMES) as environment:
-        reward = play_by_policy(environment, loaded.policy, record.task.task_id, seed, _show_lines)
+    longest = loaded.settings.episodes.answer_tokens
+    with make(folder, split=record.split, rules=rules, codec=loaded.policy.codec) as environment:
+        reward = play_by_policy(
+            environment, loaded.policy, record.task.task_id, seed, _show_lines, longest=longest
+        )
     if reward is not None:
         _show_reward(reward.tiers)
 

@@ -54,7 +54,7 @@ class EpisodePlayer:
         self._running = running
         self._situation = situation
         self._rules = rules
-        self._codec = codec
+        self.codec = codec
         self._seen = rules.visibility is Visibility.SEEN
         if self._seen and not running.start.sight:
             raise ValueError("the rules show only what the robot has seen: expected an episode with sight")
@@ -113,13 +113,18 @@ class EpisodePlayer:
         """End the episode from outside."""
         self.end = self.end or end
 
+    def says_done(self, text: str) -> bool:
+        """Return whether an answer ends the episode without a call."""
+        calls, done, _ = self._read(text)
+        return done and not calls
+
     def _read(self, text: str) -> tuple[Plan, bool, list[str]]:
         """Return the calls of an answer, whether it ends the episode, and notes about it."""
-        words = with_indices(text, self._situation) if self._codec is Codec.NAMES else text
+        words = with_indices(text, self._situation) if self.codec is Codec.NAMES else text
         try:
             return *parse_answer(words, self._situation.profile), []
         except PlanError as error:
-            return (), False, [not_an_action(error, self._codec)]
+            return (), False, [not_an_action(error, self.codec)]
 
     async def _execute(self, calls: Sequence[SkillCall]) -> tuple[list[Step], Turn | None]:
         """Execute calls up to the first that fails, and refuse those with unknown rows without execution."""

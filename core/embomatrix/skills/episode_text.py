@@ -6,6 +6,7 @@ names that the prompt gives them; an object that the policy does not know is ``s
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.describe import words_of
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.parse import DONE, PlanError, PlanReason
+from embomatrix.skills.parse import DONE, PlanError, PlanReason, plan_to_json, plan_to_lines
 from embomatrix.skills.prompt import (
     ABSENT,
     ADDED_RULES,
@@ -26,6 +27,7 @@ from embomatrix.skills.prompt import (
     held_rows,
     indexed,
     labels,
+    plan_in_names,
     prompt_for,
     robot_in_words,
     skill_lines,
@@ -103,6 +105,19 @@ def _system(codec: Codec, profile: Profile, *, seen: bool, at_once: int) -> str:
         f"Answer {end} when the task is fulfilled. A failed action changes nothing.\n"
         f"{actions}\n{RULES}{ADDED_RULES[profile]}{_SEEN if seen else ''}\nExample, open fridge 2: {call}"
     )
+
+
+def answer_text(call: SkillCall | None, known: Situation, codec: Codec) -> str:
+    """Answer with one call, or at the end if there is none, as a policy of this codec writes it."""
+    match codec:
+        case Codec.NAMES:
+            return DONE if call is None else plan_in_names((call,), known)
+        case _ if call is None:
+            return EXAMPLES[codec][1]
+        case Codec.LINES:
+            return plan_to_lines((call,))
+        case Codec.JSON:
+            return json.dumps(plan_to_json((call,))[0])
 
 
 def row_after(row: PromptRow, now: ObjectDescription, rows: Mapping[str, PromptRow]) -> PromptRow:

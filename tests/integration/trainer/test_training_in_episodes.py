@@ -10,13 +10,14 @@ import pytest
 import torch
 from rich.console import Console
 from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.small_llama import save_small_llama
 
 from embomatrix.rpc.episodes import TurnFailedError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.skills.parse import DONE
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
-from embomatrix.trainer.config.settings import read_settings
+from embomatrix.trainer.config.settings import TrainSettings, read_settings
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.episodes import teacher
 from embomatrix.trainer.episodes.client import ClusterEpisode
@@ -27,6 +28,7 @@ from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.evaluations import read_evaluations
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.policy.loading import new_policy, saved_policy
+from embomatrix.trainer.policy.playing import plays_episodes
 from embomatrix.trainer.run.loop import TrainingRun
 from embomatrix.trainer.run.starting import RunStart
 
@@ -115,7 +117,7 @@ def test_imitation_of_the_oracle_s_episodes_solves_the_training_tasks(cluster, t
     train(cluster, known, tmp_path / "run", **changes)
     episodes = json.loads((tmp_path / "run" / ORACLE_EPISODES).read_text())["episodes"]
     assert set(episodes) == {task.task.task_id for task in tasks.train}
-    assert all(turns[-1][0] == DONE for _, _, *turns in episodes.values())
+    assert all(turns[-1][0] == DONE for _, _, _, *turns in episodes.values())
     evaluation = read_evaluations(tmp_path / "run")[-1]
     assert all(answer.verdict.success for answer in evaluation.answers)
     assert json.loads(evaluation.answers[0].text)[-1] == DONE
@@ -180,8 +182,8 @@ def test_oracle_finishes_what_the_policy_began_and_that_is_imitated(cluster, tas
         assert kept["version"]["round"] == number
         episodes = kept["episodes"].values()
         assert len(episodes) == min(4, len(tasks.train))  # whatever an untrained policy did before
-        assert any(begun for _, begun, *_ in episodes)
-        assert all(begun < len(turns) and turns[-1][0] == DONE for _, begun, *turns in episodes)
+        assert any(begun for _, _, begun, *_ in episodes)
+        assert all(begun < len(turns) and turns[-1][0] == DONE for _, _, begun, *turns in episodes)
     assert taught(tmp_path / "one", 1)["episodes"] != taught(tmp_path / "one", 2)["episodes"]
 
 
@@ -279,7 +281,36 @@ def test_without_imitation_the_oracle_plays_nothing(cluster, tasks, tmp_path):
     assert not (tmp_path / "run" / ORACLE_EPISODES).exists()
 
 
-def test_language_models_are_refused(tasks):
-    settings = read_settings(None, {"model": "some/model", "episodes.visibility": "seen"})
-    with pytest.raises(TrainerError, match="for the word-level policy so far"):
-        new_policy(settings, tasks)
+def test_language_model_learns_in_episodes(cluster, tasks, tmp_path):
+    save_small_llama(tasks.train, tmp_path / "model")
+    changes = {
+        "model": str(tmp_path / "model"),
+        "codec": "lines",
+        "episodes__answer_tokens": 6,
+        "episodes__teacher_rounds": 1,
+        "episodes__teacher_episodes": 2,
+        "imitation__steps": 3,
+        "grpo__steps": 2,
+        "evaluation__samples": 1,
+        "evaluation__tasks": 2,
+    }
+    first = train(cluster, tasks, tmp_path / "one", **changes)
+    second = train(cluster, tasks, tmp_path / "two", **changes)
+    assert torch.equal(weights(first), weights(second))
+    assert not torch.equal(weights(first), weights(saved_policy(tmp_path / "model", TrainSettings())))
+    for row in figures(tmp_path / "one"):
+        assert (row["rollouts"], row["lost"]) == (9, 0)
+        assert abs(row["kl_to_old"]) < 1e-5  # what was sampled is what is trained on
+    opening = json.loads((tmp_path / "one" / ORACLE_EPISODES).read_text())
+    assert "You control a home robot step by step" in opening["systems"][0]
+    (_, _, begun, *turns), *_ = opening["episodes"].values()
+    assert (begun, turns[-1][0]) == (0, DONE)
+    assert len(taught(tmp_path / "one", 1)["episodes"]) == 2
+    kept = saved_policy(tmp_path / "one" / "reference", TrainSettings(model=str(tmp_path / "model")))
+    assert plays_episodes(kept)
+
+
+def test_language_model_in_episodes_needs_no_model_server():
+    asked = {"model": "some/model", "episodes.visibility": "seen", "sampler.url": "http://127.0.0.1:1"}
+    with pytest.raises(TrainerError, match=r"'sampler\.url': expected none in episodes"):
+        read_settings(None, asked)

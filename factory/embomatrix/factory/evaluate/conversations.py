@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,10 +14,8 @@ from embomatrix.envs.turns import LocalEpisodes
 from embomatrix.factory.evaluate.scripts import by_bundle, in_processes, situations_of
 from embomatrix.factory.evaluate.search import PlayedSearch, play_search
 from embomatrix.scripts.searching import PlacePriors
-from embomatrix.skills.episode_text import EXAMPLES, FORMAT
-from embomatrix.skills.parse import plan_to_json, plan_to_lines
+from embomatrix.skills.episode_text import FORMAT, answer_text
 from embomatrix.skills.prompt import Codec
-from embomatrix.skills.syntax import SkillCall
 from embomatrix.world.dataset import Dataset, TaskRecord
 
 Row = dict[str, Any]
@@ -80,7 +77,8 @@ def _row(record: TaskRecord, played: PlayedSearch, form: ConversationForm) -> Ro
     messages = [{"role": "system", "content": played.prompt.system}]
     for text, call in zip(played.told, played.calls, strict=True):
         messages.append({"role": "user", "content": text})
-        messages.append({"role": "assistant", "content": _answer(call, form.codec)})
+        answer = answer_text(call, played.player.observer.situation, form.codec)
+        messages.append({"role": "assistant", "content": answer})
     return {
         "task_id": record.task.task_id,
         "split": record.split,
@@ -93,12 +91,6 @@ def _row(record: TaskRecord, played: PlayedSearch, form: ConversationForm) -> Ro
         "hidden": played.hidden,
         "messages": messages,
     }
-
-
-def _answer(call: SkillCall | None, codec: Codec) -> str:
-    if call is None:
-        return EXAMPLES[codec][1]
-    return plan_to_lines((call,)) if codec is Codec.LINES else json.dumps(plan_to_json((call,))[0])
 
 
 def conversation_schema(arrow: Any) -> Any:

@@ -137,6 +137,8 @@ class EpisodesTable(_Frozen):
     """Subtracted from an episode's reward for each call."""
     failure_cost: float = Field(default=0.0, ge=0)
     """Subtracted from an episode's reward for each failed call, besides ``call_cost``."""
+    answer_tokens: int = Field(default=64, ge=1)
+    """Maximum tokens of a language model's answer. Longer ones are cut off, and what they say until there is carried out."""
     teacher_rounds: int = Field(default=0, ge=0, le=100)
     """Rounds of teaching, at equal distances within imitation: the policy begins episodes, the oracle finishes them from
     wherever that led, and what the oracle did is imitated from then on (DAgger, Ross et al. 2011).
@@ -472,6 +474,11 @@ def checked_settings(values: Mapping[str, Any]) -> TrainSettings:
     except ValidationError as error:
         raise settings_error(error) from error
     _check_teaching(settings)
+    if settings.episodes.visibility is not None and settings.sampler.url:
+        raise TrainerError(
+            "setting 'sampler.url': expected none in episodes, because the server samples whole plans: leave it or "
+            f"episodes.visibility out (found {settings.sampler.url!r})"
+        )
     return _with_server(settings) if settings.sampler.url else _without_server(settings)
 
 

@@ -14,7 +14,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from embomatrix.skills.parse import DONE
 from embomatrix.skills.prompt import Prompt
 from embomatrix.trainer.cluster.gateway import result_of
 from embomatrix.trainer.config.errors import TrainerError
@@ -149,7 +148,7 @@ class _RunningBatch:
         for row, answer in zip(rows, answers, strict=True):
             if answer is None:
                 self._episodes[row].stop()
-            elif answer in ("", DONE) and self._episodes[row].has_handover:
+            elif self._episodes[row].has_handover and self._episodes[row].player.says_done(answer):
                 self._episodes[row].hand_over()
         given = [
             (row, answer)
@@ -158,7 +157,7 @@ class _RunningBatch:
         ]
         self._answered = [row for row, _ in given]
         episodes = [self._episodes[row] for row in self._answered]
-        self._told = self._client.answer(episodes, [answer or DONE for _, answer in given])
+        self._told = self._client.answer(episodes, [answer for _, answer in given])
 
     def _wait(self, future: Future[T]) -> T:
         """Wait for the cluster. The thread of a remote learner gives up once that is closed, or Ctrl-C would wait too."""

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.status import ClusterError
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
-from embomatrix.skills.episode_text import FORMAT
-from embomatrix.skills.parse import DONE
-from embomatrix.skills.prompt import Prompt, plan_in_names
+from embomatrix.skills.episode_text import FORMAT, answer_text
+from embomatrix.skills.prompt import Prompt
 from embomatrix.trainer.cluster.gateway import PlanOutcome, refuse_without_workers, result_of
 from embomatrix.trainer.config.errors import TrainerError, first_of
 from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, PlannedEpisode
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.trainer.data.tasks import TrainingTask
-    from embomatrix.trainer.policy.tiny import TinyPolicy
+    from embomatrix.trainer.policy.protocol import Policy
 
 ORACLE_EPISODES: Final = "oracle_episodes.json"
 _FILE_VERSION: Final[Mapping[str, object]] = {"format": FORMAT, "file": 2}
@@ -48,23 +47,23 @@ class OracleEpisode:
     The policy gave the first ``begun`` answers, the oracle all others.
     """
 
-    opening: str
+    opening: Prompt
     turns: tuple[tuple[str, str], ...]
     begun: int = 0
 
-    def example(self, policy: TinyPolicy) -> ImitationExample:
+    def example(self, policy: Policy) -> ImitationExample:
         """Return the episode's tokens. Only the oracle's answers are imitated."""
         tokens: list[int] = []
         told: list[bool] = []
         begun = 0
         for number, (answer, observation) in enumerate(self.turns, start=1):
-            own = policy.encode_plan("" if answer == DONE else answer)
+            own = policy.encode_answer(answer)
             after = policy.encode_told(observation) if number < len(self.turns) else ()
             tokens += (*own, *after)
             told += [False] * len(own) + [True] * len(after)
             if number == self.begun:
                 begun = len(tokens)
-        return ImitationExample(policy.encode(Prompt("", self.opening)), tuple(tokens), tuple(told), begun)
+        return ImitationExample(policy.encode(self.opening), tuple(tokens), tuple(told), begun)
 
 
 class OracleExamples:
@@ -74,7 +73,7 @@ class OracleExamples:
     """
 
     def __init__(
-        self, episodes: Mapping[str, OracleEpisode], policy: TinyPolicy, tasks: Sequence[TrainingTask]
+        self, episodes: Mapping[str, OracleEpisode], policy: Policy, tasks: Sequence[TrainingTask]
     ) -> None:
         """Raises TrainerError if no task has one."""
         self._policy = policy
@@ -83,15 +82,16 @@ class OracleExamples:
         self.tasks = tuple(task for task in tasks if task.task.task_id in self._examples)
         if not self.tasks:
             raise TrainerError(
-                f"none of {len(tasks)} training tasks has an oracle episode of at most {policy.context} words to imitate: pass "
-                "--imitate-steps 0"
+                f"none of {len(tasks)} training tasks has an oracle episode of at most {policy.context} tokens to imitate: "
+                "pass --imitate-steps 0"
             )
 
     def add(self, episodes: Mapping[str, OracleEpisode]) -> None:
         """Add an episode for each of some tasks, as far as it fits the policy's context."""
         for name, episode in episodes.items():
             example = episode.example(self._policy)
-            if len(example.prompt) + len(example.plan) <= self._policy.context:
+            context = self._policy.context
+            if context is None or len(example.prompt) + len(example.plan) <= context:
                 self._examples.setdefault(name, []).append(example)
 
     def example(self, task: TrainingTask, rng: np.random.Generator) -> ImitationExample:
@@ -194,14 +194,14 @@ async def finish(episode: ClusterEpisode, script: SearchingScript) -> None:
     while not episode.is_over:
         known = episode.player.observer.situation
         call = script.next_call(known, steps[-1] if len(steps) > begun else None)
-        await episode.answer(DONE if call is None else plan_in_names((call,), known))
+        await episode.answer(answer_text(call, known, episode.player.codec))
 
 
 def successful(episode: ClusterEpisode, begun: int = 0) -> OracleEpisode | None:
     """Return an episode that is over as one to imitate, None if it failed or was lost. The policy began ``begun`` answers."""
     if not episode.outcome().success or episode.opening is None:
         return None
-    return OracleEpisode(episode.opening.user, tuple(zip(episode.answers, episode.told, strict=True)), begun)
+    return OracleEpisode(episode.opening, tuple(zip(episode.answers, episode.told, strict=True)), begun)
 
 
 def read_episodes(path: Path, version: Mapping[str, object]) -> dict[str, OracleEpisode] | None:
@@ -212,11 +212,16 @@ def read_episodes(path: Path, version: Mapping[str, object]) -> dict[str, Oracle
         value = parse_json(path.read_bytes())
         if value["version"] != {**version, **_FILE_VERSION}:
             return None
+        systems = [str(text) for text in value["systems"]]
         return {
-            str(task_id): OracleEpisode(str(opening), tuple((str(a), str(b)) for a, b in turns), int(begun))
-            for task_id, (opening, begun, *turns) in value["episodes"].items()
+            str(task_id): OracleEpisode(
+                Prompt(systems[system], str(opening)),
+                tuple((str(answer), str(told)) for answer, told in turns),
+                int(begun),
+            )
+            for task_id, (system, opening, begun, *turns) in value["episodes"].items()
         }
-    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
         raise TrainerError(
             f"{path} is damaged ({error}): remove it, and the episodes are played again"
         ) from error
@@ -224,8 +229,10 @@ def read_episodes(path: Path, version: Mapping[str, object]) -> dict[str, Oracle
 
 def write_episodes(path: Path, version: Mapping[str, object], episodes: Mapping[str, OracleEpisode]) -> None:
     """Keep episodes by task, with what they depend on."""
+    systems = [*dict.fromkeys(episode.opening.system for episode in episodes.values())]
     rows = {
-        task_id: [episode.opening, episode.begun, *episode.turns] for task_id, episode in episodes.items()
+        task_id: [systems.index(episode.opening.system), episode.opening.user, episode.begun, *episode.turns]
+        for task_id, episode in episodes.items()
     }
-    content = {"version": {**version, **_FILE_VERSION}, "episodes": rows}
+    content = {"version": {**version, **_FILE_VERSION}, "systems": systems, "episodes": rows}
     write_whole(path, json.dumps(content).encode("utf-8"))

@@ -10,7 +10,7 @@ import asyncio
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.episodes.terms import EpisodeTerms
     from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
-    from embomatrix.trainer.logging.display import LineDisplay
-    from embomatrix.trainer.policy.tiny import TinyPolicy
+    from embomatrix.trainer.policy.protocol import Policy
 
 TAUGHT_EPISODES: Final = "taught_episodes_{}.json"
 _TOGETHER: Final = 16
@@ -63,12 +62,20 @@ class TeachingRules:
     def of(settings: TrainSettings, terms: EpisodeTerms) -> TeachingRules:
         """Return the rules that the settings of a run ask for."""
         table, grpo = settings.episodes, settings.grpo
-        sampling = SamplingRule(1, grpo.temperature, grpo.max_new)
+        sampling = SamplingRule(1, grpo.temperature, table.answer_tokens)
         return TeachingRules(table.teacher_rounds, table.teacher_episodes, terms, sampling, settings.seed)
 
     def due(self, share: float) -> int:
         """Return the number of rounds that belong before this share of imitation. The rounds divide it into equal parts."""
         return min(self.rounds, int(share * (self.rounds + 1) + 1e-9))
+
+
+class TeachingDisplay(Protocol):
+    """Shows how far a round is, and at its end how many of its episodes succeeded."""
+
+    def teaching(self, number: int, done: int, total: int) -> None: ...
+
+    def taught(self, number: int, count: int, total: int) -> None: ...
 
 
 class Teacher:
@@ -83,11 +90,11 @@ class Teacher:
         folder: Path,
         learned: Mapping[str, object],
         rules: TeachingRules,
-        policy: TinyPolicy,
+        policy: Policy,
         workers: DataParallelWorkers,
         client: EpisodeClient,
         examples: OracleExamples,
-        display: LineDisplay,
+        display: TeachingDisplay,
     ) -> None:
         self._folder = folder
         self._learned = learned

@@ -22,6 +22,8 @@ class EpisodeTerms:
     calls_more: int
     call_cost: float = 0.0
     failure_cost: float = 0.0
+    answer_tokens: int = 64
+    """Maximum tokens of a language model's answer."""
 
     @staticmethod
     def of(settings: EpisodesTable) -> EpisodeTerms | None:
@@ -34,6 +36,7 @@ class EpisodeTerms:
             settings.calls_more,
             settings.call_cost,
             settings.failure_cost,
+            settings.answer_tokens,
         )
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from embomatrix.skills.parse import DONE
 from embomatrix.skills.prompt import Prompt
 from embomatrix.trainer.evaluation.answer_sources import OnProgress, seed_of
 from embomatrix.trainer.evaluation.episodes import EpisodeStage, Said, play_episodes
@@ -14,45 +13,44 @@ if TYPE_CHECKING:
     from embomatrix.envs.player import EpisodePlayer
     from embomatrix.trainer.evaluation.answers import AnswerSheet, EvaluationSetup
     from embomatrix.trainer.evaluation.exam import Question
+    from embomatrix.trainer.policy.chat_rows import ChatRows
     from embomatrix.trainer.policy.episode_rows import EpisodeRows
-    from embomatrix.trainer.policy.tiny import TinyPolicy
+    from embomatrix.trainer.policy.protocol import Policy
 
 
 class ConversingSubject:
     """Policy that plays one episode. It keeps its key-value cache between two answers."""
 
-    def __init__(self, policy: TinyPolicy, setup: EvaluationSetup, task_id: str, sample: int) -> None:
+    def __init__(self, policy: Policy, setup: EvaluationSetup, task_id: str, sample: int) -> None:
         self._policy = policy
         self._temperature = setup.temperature
+        self._longest = setup.max_tokens
         self._seed = seed_of(setup.seed, task_id, sample)
-        self._episode: EpisodeRows | None = None
+        self._episode: EpisodeRows | ChatRows | None = None
 
     async def answer(
         self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
     ) -> Said:
         """Return the next call, or that the task is done."""
         if self._episode is None:
-            self._episode = self._begun(told[-1])
+            self._episode = self._begun(Prompt(system, told[-1]))
         else:
             self._episode.tell([0], [told[-1]])
         answer = self._episode.answer([0])[0]
         if answer is None:
             player.stop()
             return Said("")
-        return Said(answer or DONE, completion_tokens=len(self._policy.encode_plan(answer)))
+        return Said(answer, completion_tokens=len(self._policy.encode_answer(answer)))
 
-    def _begun(self, opening: str) -> EpisodeRows:
-        import torch
+    def _begun(self, opening: Prompt) -> EpisodeRows | ChatRows:
+        from embomatrix.trainer.policy.playing import rows_of_episodes
 
-        from embomatrix.trainer.policy.episode_rows import EpisodeRows
-
-        generator = torch.Generator(self._policy.device).manual_seed(self._seed)
-        prompt = self._policy.encode(Prompt("", opening))
-        return EpisodeRows(self._policy, [prompt], 1, self._temperature, generator)
+        prompt = self._policy.encode(opening)
+        return rows_of_episodes(self._policy, [prompt], 1, self._temperature, self._seed, self._longest)
 
 
 def converse_in_episodes(
-    policy: TinyPolicy,
+    policy: Policy,
     stage: EpisodeStage,
     questions: Sequence[Question],
     sheet: AnswerSheet,

@@ -195,6 +195,7 @@ class EpisodeSampler(Sampler):
     ) -> None:
         super().__init__(workers, policy.codec, prompt_builder, gateway, settings)
         self._policy = policy
+        self._terms = terms
         self._client = EpisodeClient(gateway, terms, policy.codec)
 
     def _chunks(
@@ -208,7 +209,7 @@ class EpisodeSampler(Sampler):
             )
             for part in parts
         ]
-        rule = SamplingRule.of(self._settings)
+        rule = replace(SamplingRule.of(self._settings), max_new=self._terms.answer_tokens)
         played = play_batches(batches, self._workers, self._client, self._policy, rule)
         return [_chunk_of(each, here=self._workers.remote(each.batch.index) is None) for each in played]
 

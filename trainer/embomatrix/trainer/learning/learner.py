@@ -11,9 +11,10 @@ from torch import Tensor
 from embomatrix.trainer.config.settings import GrpoSettings
 from embomatrix.trainer.learning.likelihood import negative_log_likelihood
 from embomatrix.trainer.learning.objective import LossInputs, LossMetrics, LossTotals, surrogate_loss
+from embomatrix.trainer.policy.chat_rows import ChatRows
 from embomatrix.trainer.policy.episode_rows import EpisodeRows
+from embomatrix.trainer.policy.playing import rows_of_episodes
 from embomatrix.trainer.policy.protocol import ImitationExample, Policy, Samples, Tokens
-from embomatrix.trainer.policy.tiny import TinyPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,9 @@ class Microbatch:
 
 @dataclass(frozen=True, slots=True)
 class SamplingRule:
-    """Rule of sampling: ``group`` plans per prompt, of at most ``max_new`` tokens."""
+    """Rule of sampling: ``group`` plans or episodes per prompt. A plan, or an answer in an episode, has at most ``max_new``
+    tokens.
+    """
 
     group: int
     temperature: float
@@ -55,7 +58,7 @@ class Learner:
         self.policy = policy
         self.reference = reference
         self._settings = settings
-        self._episodes: dict[int, EpisodeRows] = {}
+        self._episodes: dict[int, EpisodeRows | ChatRows] = {}
 
     def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
         """Draw plans for each prompt with a generator of this seed."""
@@ -65,9 +68,9 @@ class Learner:
 
     def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
         """Begin the batch of episodes of this number, with ``rule.group`` for each prompt."""
-        assert isinstance(self.policy, TinyPolicy), "the settings refuse other policies"
-        generator = torch.Generator(self.policy.device).manual_seed(seed)
-        self._episodes[number] = EpisodeRows(self.policy, prompts, rule.group, rule.temperature, generator)
+        self._episodes[number] = rows_of_episodes(
+            self.policy, prompts, rule.group, rule.temperature, seed, rule.max_new
+        )
 
     def answer_episodes(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
         """Tell episodes of a batch what happened, unless they begin, and sample their answers.

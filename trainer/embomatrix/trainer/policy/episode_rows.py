@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from embomatrix.skills.parse import DONE
 from embomatrix.trainer.policy.compute_dtype import frozen_weights
 from embomatrix.trainer.policy.decoder import PlanCache, Shortlist
 from embomatrix.trainer.policy.protocol import Samples, Tokens, draw, pad_left
@@ -25,7 +26,7 @@ _LONGEST_ANSWER: Final = 16
 
 
 @dataclass(slots=True)
-class _Row:
+class EpisodeRow:
     """Tokens of one episode behind its prompt, which of them the policy wrote, and their log-probabilities."""
 
     tokens: list[int] = field(default_factory=list)
@@ -34,6 +35,8 @@ class _Row:
     answers: list[str] = field(default_factory=list)
     is_full: bool = False
     """True if the context had no room for another answer."""
+    is_open: bool = False
+    """True if the last answer was cut off before its end."""
 
     def add(self, tokens: Sequence[int], logprobs: Sequence[float] | None) -> None:
         """Append tokens. Those that the policy was told have no log-probabilities."""
@@ -56,7 +59,7 @@ class EpisodeRows:
         self._policy = policy
         self._temperature = temperature
         self._generator = generator
-        self._rows = [_Row() for _ in range(len(prompts) * group)]
+        self._rows = [EpisodeRow() for _ in range(len(prompts) * group)]
         self._prompt_lengths = [len(prompt) for prompt in prompts]
         with torch.no_grad(), frozen_weights(policy.module):
             self._prompts = policy.module.encode_prompts(*pad_left(prompts, PAD, policy.device))
@@ -137,7 +140,7 @@ class EpisodeRows:
         ):
             if length:
                 self._rows[row].add(words[:length], scores[:length])
-                self._rows[row].answers.append(self._policy.vocabulary.decode_plan(words[:length]))
+                self._rows[row].answers.append(self._policy.vocabulary.decode_plan(words[:length]) or DONE)
         return [self._rows[row].answers[-1] for row in rows]
 
     @torch.no_grad()
@@ -177,26 +180,28 @@ class EpisodeRows:
         self._plan = self._plan.select(kept) if self._plan else None
 
     def samples(self) -> Samples:
-        """Return all rows as samples, without what they were told at their end. Texts are answers, one a line.
+        """Return all rows as samples."""
+        return samples_of_rows(self._rows, self._policy.device)
 
-        Cut-off rows are those whose context had no room for another answer. There is at least one column.
-        """
-        device = self._policy.device
-        for row in self._rows:
-            last = max((at for at, own in enumerate(row.own, 1) if own), default=0)
-            del row.tokens[last:], row.own[last:], row.logprobs[last:]
 
-        def padded(values: Sequence[Sequence[float]], kind: torch.dtype) -> Tensor:
-            longest = [0] * max(1, *map(len, values))
-            return pad_sequence([torch.tensor(each, dtype=kind) for each in (*values, longest)], True)[
-                :-1
-            ].to(device)
+def samples_of_rows(rows: Sequence[EpisodeRow], device: torch.device) -> Samples:
+    """Return episodes as samples, without what they were told at their end. Texts are answers, one a line.
 
-        mask = padded([row.own for row in self._rows], torch.bool)
-        return Samples(
-            padded([row.tokens for row in self._rows], torch.long),
-            mask,
-            padded([row.logprobs for row in self._rows], torch.float32),
-            tuple("\n".join(row.answers) for row in self._rows),
-            torch.tensor([row.is_full for row in self._rows], device=device),
-        )
+    Cut-off rows are those whose context had no room for another answer. There is at least one column.
+    """
+    for row in rows:
+        last = max((at for at, own in enumerate(row.own, 1) if own), default=0)
+        del row.tokens[last:], row.own[last:], row.logprobs[last:]
+
+    def padded(values: Sequence[Sequence[float]], kind: torch.dtype) -> Tensor:
+        longest = [0] * max(1, *map(len, values))
+        filled = pad_sequence([torch.tensor(each, dtype=kind) for each in (*values, longest)], True)
+        return filled[:-1].to(device)
+
+    return Samples(
+        padded([row.tokens for row in rows], torch.long),
+        padded([row.own for row in rows], torch.bool),
+        padded([row.logprobs for row in rows], torch.float32),
+        tuple("\n".join(row.answers) for row in rows),
+        torch.tensor([row.is_full for row in rows], device=device),
+    )

@@ -39,6 +39,10 @@ TOKENIZERS: Final = (
 CONFIG: Final = "config.json"
 CODEC_KEY: Final = "embomatrix_codec"
 """Key in the model's config.json for the codec that it was trained in."""
+EPISODES_KEY: Final = "embomatrix_episodes"
+"""Key in the model's config.json that says whether it was trained in episodes."""
+_ANSWER: Final = "an-answer-in-the-middle"
+"""Text that no chat template contains."""
 REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name; `embomatrix model import-gguf` makes a folder"
 
 
@@ -67,6 +71,8 @@ class HfPolicy:
         self._has_plain_head = has_plain_head(model)
         self._gradient_checkpointing = gradient_checkpointing
         self.has_adapters = False
+        self.in_episodes = False
+        """True if the policy answers call by call in episodes, instead of with whole plans."""
         self._tokenizer = tokenizer
         self.context = _context_of(model)
         self.end_tokens = _end_tokens(model, tokenizer)
@@ -110,7 +116,7 @@ class HfPolicy:
         if cast_to is not dtype and device == "cpu":
             use_compute_dtype(model, cast_to, model.get_output_embeddings())
         mixed = device != "cpu" and all_learn and not exact
-        return cls(
+        policy = cls(
             model,
             tokenizer,
             settings.codec,
@@ -118,6 +124,8 @@ class HfPolicy:
             gradient_checkpointing=settings.gradient_checkpointing,
             autocast=torch.bfloat16 if mixed else None,
         )
+        policy.in_episodes = bool(getattr(model.config, EPISODES_KEY, False))
+        return policy
 
     def adapt(self, lora: LoraSettings, *, seed: int, saved: Path | None = None) -> None:
         """Freeze the model and train low-rank adapters, new ones or those in the folder ``saved``. Raises TrainerError."""
@@ -155,6 +163,27 @@ class HfPolicy:
     def encode_plan(self, text: str) -> Tokens:
         return (*self._tokens(text), self.end_tokens[0])
 
+    def encode_answer(self, text: str) -> Tokens:
+        """Return the tokens of an answer in an episode, with its end token."""
+        return self.encode_plan(text)
+
+    def encode_told(self, text: str) -> Tokens:
+        """Return the tokens between two answers: the rest of the first one's turn, the user's turn, the start of the next."""
+        return self._tokens(self._told(text))
+
+    def _told(self, text: str) -> str:
+        if not getattr(self._tokenizer, "chat_template", None):
+            return f"\n{text}\nPlan:\n"
+        turns = [
+            {"role": "user", "content": "begin"},
+            {"role": "assistant", "content": _ANSWER},
+            {"role": "user", "content": text},
+        ]
+        chat = str(self._tokenizer.apply_chat_template(turns, tokenize=False, add_generation_prompt=True))
+        rest = chat.partition(_ANSWER)[2]
+        ends = [self._tokenizer.decode([token]) for token in self.end_tokens]
+        return rest.removeprefix(next((end for end in ends if rest.startswith(end)), ""))
+
     def unknown_words(self, text: str) -> frozenset[str]:
         unknown = self._tokenizer.unk_token_id
         if unknown is None or unknown not in self._tokens(text):
@@ -173,9 +202,9 @@ class HfPolicy:
         max_new: int,
         generator: torch.Generator,
     ) -> Samples:
-        with frozen_weights(self.module), self._precision():
-            cache, mask, states = self._read(prompts, group)
-            scores = self._head(states)[:, -1].float().repeat_interleave(group, dim=0)  # (rows, V)
+        with self.computing():
+            cache, mask, states = self.read(prompts, group)
+            scores = self.next_scores(states).repeat_interleave(group, dim=0)  # (rows, V)
             rows = scores.shape[0]
             lengths = mask.sum(dim=1)  # (rows,)
             end = torch.tensor(self.end_tokens, device=scores.device)
@@ -191,8 +220,8 @@ class HfPolicy:
                 if bool(done.all()) or at == max_new - 1:
                     break
                 mask = torch.cat([mask, mask.new_ones(rows, 1)], dim=1)
-                states = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)
-                scores = self._head(states)[:, -1].float()
+                states = self.extend(choice[:, None], mask, (lengths + at)[:, None], cache)
+                scores = self.next_scores(states)
         drawn, own = torch.stack(tokens, dim=1), torch.stack(masks, dim=1)
         return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own), ~done)
 
@@ -215,6 +244,26 @@ class HfPolicy:
         empty = chosen.new_zeros(mask.shape)
         return TokenScores(empty.masked_scatter(mask, chosen), empty.masked_scatter(mask, entropy))
 
+    @contextlib.contextmanager
+    def computing(self) -> Iterator[None]:
+        """Context for passes without gradients, between which the weights do not change."""
+        with frozen_weights(self.module), self._precision():
+            yield
+
+    def next_scores(self, states: Tensor) -> Tensor:
+        """Scores (rows, V) of the tokens that follow the last of some states (rows, T, C)."""
+        scores: Tensor = self._head(states)[:, -1].float()
+        return scores
+
+    def text_of(self, tokens: Sequence[int]) -> str:
+        """Decode the tokens of an answer without special tokens."""
+        return str(self._tokenizer.decode(list(tokens), skip_special_tokens=True))
+
+    @property
+    def pad(self) -> int:
+        """Token that fills rows."""
+        return self._pad
+
     @property
     def _head(self) -> Any:
         """Layer from the states of ``_run`` to scores."""
@@ -236,14 +285,14 @@ class HfPolicy:
 
     def _states(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
         """States (rows, T, C) before each token (rows, T). The prompt of a group runs once."""
-        cache, prompt_mask, first = self._read(prompts, group)
+        cache, prompt_mask, first = self.read(prompts, group)
         states = first.repeat_interleave(group, dim=0)  # (rows, 1, C)
         length = tokens.shape[1]
         if length > 1:
             seen = torch.cat([prompt_mask, prompt_mask.new_ones(tokens.shape[0], length - 1)], dim=1)
             begin = prompt_mask.sum(dim=1, keepdim=True)
             positions = begin + torch.arange(length - 1, device=tokens.device)
-            states = torch.cat([states, self._extend(tokens[:, :-1], seen, positions, cache)], dim=1)
+            states = torch.cat([states, self.extend(tokens[:, :-1], seen, positions, cache)], dim=1)
         return states
 
     def _states_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
@@ -262,7 +311,7 @@ class HfPolicy:
                 use_cache=False,
             )
 
-    def _read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
+    def read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
         """Run the prompts once.
 
         Return cache and mask (rows, P), repeated for the samples, and the last state of each prompt (prompts, 1, C).
@@ -283,7 +332,7 @@ class HfPolicy:
         cache.batch_repeat_interleave(group)
         return cache, mask.repeat_interleave(group, dim=0), states
 
-    def _extend(self, tokens: Tensor, mask: Tensor, positions: Tensor, cache: Any) -> Tensor:
+    def extend(self, tokens: Tensor, mask: Tensor, positions: Tensor, cache: Any) -> Tensor:
         """States (rows, T, C) after tokens (rows, T) that continue the cache."""
         return self._run(
             tokens,
@@ -335,6 +384,7 @@ class HfPolicy:
 
         folder.mkdir(parents=True, exist_ok=True)
         setattr(self.module.config, CODEC_KEY, self.codec.value)
+        setattr(self.module.config, EPISODES_KEY, self.in_episodes)
         try:
             model = self.module
             if self.has_adapters:

@@ -43,12 +43,9 @@ def is_word_level(model: str) -> bool:
 def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
     """Create the initial policy of a run. Raises TrainerError if the model is unknown or can't be loaded."""
     if not is_word_level(settings.model):
-        if settings.episodes.visibility is not None:
-            raise TrainerError(
-                "episodes.visibility is for the word-level policy so far: leave it out, or pass --model tiny; language models "
-                "learn in episodes through TRL (docs/adapters.md)"
-            )
-        return _language_model(settings.model, settings)
+        model = _language_model(settings.model, settings)
+        model.in_episodes = settings.episodes.visibility is not None
+        return model
     if settings.model != TINY:
         check_word_level(settings)
         policy = saved_policy(Path(settings.model), settings)

@@ -86,6 +86,14 @@ class Policy(Protocol):
         """Return the tokens of a plan with its end token: the target of imitation."""
         ...
 
+    def encode_answer(self, text: str) -> Tokens:
+        """Return the tokens of an answer in an episode with its end token: the target of imitation."""
+        ...
+
+    def encode_told(self, text: str) -> Tokens:
+        """Return the tokens of what the policy is told between two answers of an episode."""
+        ...
+
     def unknown_words(self, text: str) -> frozenset[str]:
         """Return the words of a plan that the policy can't write."""
         ...

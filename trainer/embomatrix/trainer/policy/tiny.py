@@ -7,12 +7,13 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final, Self, TypeGuard
+from typing import Final, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from embomatrix.skills.parse import DONE
 from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.trainer.policy.compute_dtype import frozen_weights
 from embomatrix.trainer.policy.decoder import (
@@ -140,6 +141,10 @@ class TinyPolicy:
 
     def encode_plan(self, text: str) -> Tokens:
         return (*self.vocabulary.encode_plan(text), END)
+
+    def encode_answer(self, text: str) -> Tokens:
+        """Return the tokens of an answer in an episode. The policy says that it is done by an answer without words."""
+        return self.encode_plan("" if text == DONE else text)
 
     def encode_told(self, text: str) -> Tokens:
         """Return the tokens of what the policy is told in an episode."""
@@ -342,11 +347,6 @@ class TinyPolicy:
     @staticmethod
     def is_saved_in(folder: Path) -> bool:
         return (folder / _DESCRIPTION).is_file()
-
-
-def plays_episodes(policy: object) -> TypeGuard[TinyPolicy]:
-    """Return True for a policy that was trained in episodes."""
-    return isinstance(policy, TinyPolicy) and policy.single_calls
 
 
 def _all_places(tokens: Tensor) -> Tensor:

@@ -39,7 +39,6 @@ from embomatrix.trainer.logging.outcome import RunOutcome, write_outcome
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
 from embomatrix.trainer.logging.report import REPORT, TrainedOn, TrainingSummary, rates_of, write_report
 from embomatrix.trainer.logging.trackers import Tracker
-from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.run.imitation import run_imitation
 from embomatrix.trainer.run.starting import REFERENCE, RunStart, imitation_identity
 from embomatrix.trainer.serving.sampler import ServerSampler
@@ -128,12 +127,7 @@ class TrainingRun:
         start, terms, policy = self._start, self._terms, self._start.policy
         budget = self._settings.imitation
         has_budget = budget.seconds > 0 if budget.steps is None else budget.steps > 0
-        if (
-            terms is None
-            or not isinstance(policy, TinyPolicy)
-            or not has_budget
-            or self._progress.imitation.done
-        ):
+        if terms is None or not has_budget or self._progress.imitation.done:
             return None, None
         planned = [
             PlannedEpisode(task, training_seed(self._settings.seed, task.task.task_id, 0))
@@ -222,7 +216,7 @@ class TrainingRun:
             start.policy,
             planned,
             EpisodeClient(self._gateway, terms, start.policy.codec),
-            SamplingRule(samples, settings.temperature, self._settings.grpo.max_new),
+            SamplingRule(samples, settings.temperature, terms.answer_tokens),
             chunk=settings.chunk,
             seed=seed,
             report=report,
