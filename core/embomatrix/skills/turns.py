@@ -55,7 +55,7 @@ class EpisodePrefix:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """What the oracle, which sees the goal and the whole state, would do from here."""
+    """Advice of the oracle, which sees the goal and the whole state: how it would go on from here."""
 
     plan: Plan = ()
     """Calls that reach the goal; none if it holds, or if no plan was found."""

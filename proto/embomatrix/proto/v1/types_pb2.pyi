@@ -344,7 +344,7 @@ Global___StepResult: typing_extensions.TypeAlias = StepResult
 
 @typing.final
 class Advice(google.protobuf.message.Message):
-    """What the oracle, which sees the goal and the whole state, would do from a state."""
+    """Advice of the oracle, which sees the goal and the whole state: how it would go on from a state."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 

@@ -47,7 +47,7 @@ class ClusterEpisode:
         self.answers: list[str] = []
         """Answers so far."""
         self.told: list[str] = []
-        """What was told after each answer."""
+        """Texts that were told after the answers."""
         self.begun = 0
         """Answers of the policy before another took over."""
         self.lost: InfraFailure | None = None
