@@ -275,7 +275,7 @@ def table() -> dict[str, Decoder]:
             _oracle_episodes,
             (TrainerError,),
             lambda: (
-                b'{"version": {"seed": 0, "format": 2, "file": 2}, "systems": [""], "episodes": {"task": [0, "room '
+                b'{"version": {"seed": 0, "format": 2, "file": 3}, "systems": [""], "episodes": {"task": [0, "room '
                 b'kitchen_0", 1, ["open fridge", "did"], ["done", "robot"]]}}',
             ),
             frozenset({"trainer.episodes.oracle:read_episodes"}),

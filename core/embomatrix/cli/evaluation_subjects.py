@@ -78,7 +78,8 @@ def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
     in_episodes = plays_episodes(policy)
     room = trained.episodes.answer_tokens if in_episodes else room_for(trained.grpo.max_new, prompts, ruler)
     max_tokens = settings.max_tokens or room
-    check_context(prompts, max_tokens, ruler, MAX_TOKENS)
+    if not in_episodes:
+        check_context(prompts, max_tokens, ruler, MAX_TOKENS)
     rows = trained.prompt.rows
     if in_episodes:
         if not isinstance(exam, EpisodeExam):

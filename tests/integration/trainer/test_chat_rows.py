@@ -10,12 +10,13 @@ from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.episodes.oracle import OracleEpisode
 from embomatrix.trainer.learning.likelihood import negative_log_likelihood
 from embomatrix.trainer.policy.chat_rows import ChatRows
-from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.loading import saved_policy
+from embomatrix.trainer.policy.hf import HfPolicy, attention_window
+from embomatrix.trainer.policy.loading import new_policy, saved_policy
 from embomatrix.trainer.policy.playing import plays_episodes, rows_of_episodes
 
 TASKS = make_tasks(6, 2)
@@ -137,19 +138,64 @@ def test_episode_ends_where_the_context_has_no_room_for_another_answer():
     assert 40 + samples.tokens.shape[1] <= 80
 
 
+SPACED = "{% for each in messages %}{{ each.role }}: {{ each.content }} <end>{% endfor %}assistant:"
+PLAIN = "{% for each in messages %}[{{ each.role }}]{{ each.content }}{% endfor %}[assistant]"
+TURNS = CHATML.replace("<end>", "<turn>")
+
+
 @pytest.mark.parametrize(
-    ("template", "expected"),
+    ("template", "end", "between"),
     [
-        (CHATML, "\n<|start|>user\ndid it<end>\n<|start|>assistant\n"),
-        (
-            "{% for each in messages %}[{{ each.role }}]{{ each.content }}{% endfor %}[assistant]",
-            "[user]did it[assistant]",
-        ),
-        (None, "\ndid it\nPlan:\n"),
+        (CHATML, "<end>", "<end>\n<|start|>user\ndid it<end>\n<|start|>assistant\n"),
+        (SPACED, "<end>", "<end>user: did it <end>assistant:"),
+        (PLAIN, "<end>", "[user]did it[assistant]"),
+        (TURNS, "<turn>", "<turn>\n<|start|>user\ndid it<turn>\n<|start|>assistant\n"),
     ],
 )
-def test_text_between_two_answers_follows_the_template(template, expected):
-    assert policy(template)._told("did it") == expected
+def test_tokens_between_two_answers_follow_the_template(template, end, between):
+    made = policy(template)
+    made._tokenizer.add_special_tokens({"additional_special_tokens": ["<turn>"]})
+    known = made._tokenizer.convert_tokens_to_ids(end)
+    assert made._between("did it") == between
+    assert made.answer_end == known
+    assert set(made.answer_ends) == {known, *made.end_tokens}
+    assert made.encode_answer("move 1")[-1] == known
+    whole = made._tokens(between)
+    assert made.encode_told("did it") == (whole[1:] if between.startswith(end) else whole)
+
+
+def test_without_a_template_an_answer_follows_its_name():
+    assert POLICY.encode_told("did it") == POLICY._tokens("\ndid it\nAnswer:\n")
+    assert POLICY.answer_end == POLICY.end_tokens[0]
+
+
+def test_template_that_leaves_answers_out_is_refused():
+    forgetful = "{% for each in messages if each.role == 'user' %}{{ each.content }}{% endfor %}"
+    with pytest.raises(TrainerError, match="leaves earlier answers out"):
+        policy(forgetful).encode_told("did it")
+
+
+def small(config, **changes):
+    sizes = {"hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+    more = {"num_key_value_heads": 1, "vocab_size": len(POLICY._tokenizer), "max_position_embeddings": 2048}
+    return config(**{**sizes, **more, "eos_token_id": 1, **changes})
+
+
+def test_model_with_a_window_of_attention_is_refused_in_episodes(tmp_path):
+    from transformers import MistralConfig, MistralForCausalLM, Qwen2Config, Qwen2ForCausalLM
+
+    narrow = MistralForCausalLM(small(MistralConfig, sliding_window=32))
+    unused = Qwen2ForCausalLM(small(Qwen2Config, sliding_window=32, use_sliding_window=False))
+    assert (attention_window(narrow), attention_window(unused)) == (32, None)
+    for model, refused in ((narrow, True), (unused, False)):
+        folder = tmp_path / type(model).__name__
+        HfPolicy(model, POLICY._tokenizer, Codec.LINES, "small").save(folder)
+        chosen = TrainSettings.model_validate({"model": str(folder), "episodes": {"visibility": "seen"}})
+        if refused:
+            with pytest.raises(TrainerError, match="attend to the last 32 tokens only"):
+                new_policy(chosen, TASKS)
+        else:
+            assert plays_episodes(new_policy(chosen, TASKS))
 
 
 def test_imitation_of_an_episode_counts_the_answers_of_the_oracle_alone():
@@ -169,9 +215,15 @@ def test_imitation_of_an_episode_counts_the_answers_of_the_oracle_alone():
     assert negative_log_likelihood(made, [whole]).item() == pytest.approx(-scored.sum().item(), rel=1e-4)
 
 
-def test_saved_model_knows_that_it_plays_episodes(tmp_path):
-    made = policy()
-    assert not plays_episodes(made)
-    made.in_episodes = True
-    made.save(tmp_path)
-    assert plays_episodes(saved_policy(tmp_path, TrainSettings(model=str(tmp_path))))
+@pytest.mark.parametrize("rank", [0, 2])
+def test_saved_model_knows_that_it_plays_episodes(tmp_path, rank):
+    POLICY.save(tmp_path / "plain")
+    settings = {"model": str(tmp_path / "plain"), "lora": {"rank": rank}, "episodes": {"visibility": "seen"}}
+    chosen = TrainSettings.model_validate(settings)
+    made = new_policy(chosen, TASKS)
+    made.save(tmp_path / "run")
+    assert plays_episodes(made)
+    assert plays_episodes(saved_policy(tmp_path / "run", chosen))  # as a resumed run loads it
+    assert plays_episodes(saved_policy(tmp_path / "run", TrainSettings(), learns=False))
+    with pytest.raises(TrainerError, match=r"writes the calls of episodes: set episodes\.visibility"):
+        new_policy(TrainSettings(model=str(tmp_path / "run")), TASKS)

@@ -158,7 +158,7 @@ def test_episodes_of_the_oracle_are_played_again_if_the_run_is_another(cluster, 
     assert path.read_text() == kept
     train(cluster, tasks, tmp_path / "run", episodes__visibility="full", **changes)
     told = json.loads(path.read_text())
-    assert told["version"]["episodes"]["visibility"] == "full"
+    assert told["version"]["visibility"] == "full"
     assert "pick_up" in path.read_text()
 
 

@@ -138,7 +138,7 @@ class EpisodesTable(_Frozen):
     failure_cost: float = Field(default=0.0, ge=0)
     """Subtracted from an episode's reward for each failed call, besides ``call_cost``."""
     answer_tokens: int = Field(default=64, ge=1)
-    """Maximum tokens of a language model's answer. Longer ones are cut off, and what they say until there is carried out."""
+    """Maximum tokens of a language model's answer. Longer ones are cut off, and what they say up to there is carried out."""
     teacher_rounds: int = Field(default=0, ge=0, le=100)
     """Rounds of teaching, at equal distances within imitation: the policy begins episodes, the oracle finishes them from
     wherever that led, and what the oracle did is imitated from then on (DAgger, Ross et al. 2011).

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import functools
+import itertools
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 _NOTHING = Prompt("", "task")
 """Prompt of a task whose episodes were all lost before they began."""
+_AT_ONCE = 2
+"""Batches that a learner plays at a time: one is sampled while the cluster executes the other's calls. Each has a cache."""
 _LOOK_S = 0.5
 """Seconds between two looks whether the trainer has ended, while its process waits for the cluster."""
 
@@ -84,13 +87,17 @@ def play_batches(
         by_learner.setdefault(workers.remote(batch.index), []).append(batch)
 
     def play(own: Sequence[EpisodeBatch], learner: Learner | RemoteLearner) -> list[PlayedBatch]:
-        running = [_RunningBatch(batch, learner, client, policy, rule) for batch in own]
-        waiting = deque(running)
+        coming = (_RunningBatch(batch, learner, client, policy, rule) for batch in own)
+        waiting = deque(itertools.islice(coming, _AT_ONCE))
+        done = []
         while waiting:
             first = waiting.popleft()
             if first.advance():
                 waiting.append(first)
-        return [each.result() for each in running]
+            else:
+                done.append(first.result())
+                waiting.extend(itertools.islice(coming, 1))
+        return done
 
     jobs = [(own[0].index, functools.partial(play, own)) for own in by_learner.values()]
     played = {each.batch.index: each for part in workers.map(jobs) for each in part}

@@ -31,8 +31,11 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy
 
 ORACLE_EPISODES: Final = "oracle_episodes.json"
-_FILE_VERSION: Final[Mapping[str, object]] = {"format": FORMAT, "file": 2}
-"""Versions of the texts of episodes, and of the files that keep them. Files of version 1 did not say who gave an answer."""
+_FILE_VERSION: Final[Mapping[str, object]] = {"format": FORMAT, "file": 3}
+"""Versions of the texts of episodes, and of the files that keep them.
+
+Files of version 1 did not say who gave an answer, and neither they nor those of version 2 had system texts.
+"""
 _REPORT_S: Final = 0.5
 _SCENES: Final = 4
 """Scenes whose episodes are played at a time: with more, workers would load them again and again."""

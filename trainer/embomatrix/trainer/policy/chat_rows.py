@@ -49,7 +49,7 @@ class ChatRows:
         self._playing = torch.arange(len(self._rows), device=self._device)
         """Row of each row of the tensors below. Finished ones leave."""
         self._lengths = self._mask.sum(dim=1)  # (rows,)
-        self._ends = torch.tensor(policy.end_tokens, device=self._device)
+        self._ends = torch.tensor(policy.answer_ends, device=self._device)
 
     @torch.no_grad()
     def answer(self, rows: Sequence[int]) -> list[str | None]:
@@ -123,7 +123,7 @@ class ChatRows:
         told = dict(zip(rows, texts, strict=True))
         encoded = []
         for row in self._playing.tolist():
-            ending = (self._policy.end_tokens[0],) if self._rows[row].is_open else ()
+            ending = (self._policy.answer_end,) if self._rows[row].is_open else ()
             words = (*ending, *self._policy.encode_told(told[row]))[: max(0, self._room(row))]
             self._rows[row].add(words, None)
             encoded.append(torch.tensor(words, dtype=torch.long))

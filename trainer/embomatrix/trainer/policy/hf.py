@@ -141,48 +141,78 @@ class HfPolicy:
 
     def encode(self, prompt: Prompt) -> Tokens:
         """Apply the chat template if the model has one, else join system text, user text and "Plan:"."""
-        if getattr(self._tokenizer, "chat_template", None):
+        if self._has_template:
             return self._tokens(self._chat(prompt))
-        return self._tokens(f"{prompt.system}\n\n{prompt.user}\nPlan:\n")
+        return self._tokens(
+            f"{prompt.system}\n\n{prompt.user}\n{'Answer' if self.in_episodes else 'Plan'}:\n"
+        )
 
     def _chat(self, prompt: Prompt) -> str:
         """Text of the chat template. A template without a system role gets the system text in the user's message."""
         from jinja2 import TemplateError
 
-        render = functools.partial(
-            self._tokenizer.apply_chat_template, tokenize=False, add_generation_prompt=True
-        )
         user = {"role": "user", "content": prompt.user}
         # Gemma's template refuses the role, and some others leave the message out.
         with contextlib.suppress(TemplateError):
-            text = str(render([{"role": "system", "content": prompt.system}, user]))
+            text = self._render([{"role": "system", "content": prompt.system}, user])
             if prompt.system.strip() in text:
                 return text
-        return str(render([{**user, "content": f"{prompt.system}\n\n{prompt.user}"}]))
+        return self._render([{**user, "content": f"{prompt.system}\n\n{prompt.user}"}])
 
     def encode_plan(self, text: str) -> Tokens:
         return (*self._tokens(text), self.end_tokens[0])
 
+    @functools.cached_property
+    def answer_end(self) -> int:
+        """Token that ends an answer in an episode: the one that the chat template puts there, else the one that ends a plan."""
+        first = self._tokens(self._between("")) if self._has_template else ()
+        special = {*self._tokenizer.all_special_ids, *self._tokenizer.added_tokens_decoder}
+        ends = first[:1] if first and first[0] in special - {self._tokenizer.unk_token_id} else ()
+        return next(iter(ends), self.end_tokens[0])
+
+    @property
+    def answer_ends(self) -> tuple[int, ...]:
+        """Tokens after which an answer is over."""
+        return tuple(dict.fromkeys((self.answer_end, *self.end_tokens)))
+
     def encode_answer(self, text: str) -> Tokens:
         """Return the tokens of an answer in an episode, with its end token."""
-        return self.encode_plan(text)
+        return (*self._tokens(text), self.answer_end)
 
     def encode_told(self, text: str) -> Tokens:
-        """Return the tokens between two answers: the rest of the first one's turn, the user's turn, the start of the next."""
-        return self._tokens(self._told(text))
+        """Return the tokens after the end of an answer: the rest of its turn, the user's turn, and the start of the next.
 
-    def _told(self, text: str) -> str:
-        if not getattr(self._tokenizer, "chat_template", None):
-            return f"\n{text}\nPlan:\n"
+        Raises TrainerError for a chat template that leaves earlier answers out.
+        """
+        if not self._has_template:
+            return self._tokens(f"\n{text}\nAnswer:\n")
+        tokens = self._tokens(self._between(text))
+        return tokens[1:] if tokens[0] == self.answer_end else tokens
+
+    @property
+    def _has_template(self) -> bool:
+        return bool(getattr(self._tokenizer, "chat_template", None))
+
+    def _between(self, text: str) -> str:
+        """Text of the chat template from the end of an answer to the beginning of the next. Raises TrainerError."""
         turns = [
             {"role": "user", "content": "begin"},
             {"role": "assistant", "content": _ANSWER},
             {"role": "user", "content": text},
         ]
-        chat = str(self._tokenizer.apply_chat_template(turns, tokenize=False, add_generation_prompt=True))
-        rest = chat.partition(_ANSWER)[2]
-        ends = [self._tokenizer.decode([token]) for token in self.end_tokens]
-        return rest.removeprefix(next((end for end in ends if rest.startswith(end)), ""))
+        _, answer, rest = self._render(turns).partition(_ANSWER)
+        if not answer:
+            raise TrainerError(
+                f"the chat template of {self.name} leaves earlier answers out: expected one that keeps them; pass another model"
+            )
+        return rest.lstrip(" ")
+
+    def _render(self, turns: list[dict[str, str]]) -> str:
+        """Apply the chat template. Templates that can leave thoughts out do so, because plans and calls are short."""
+        rendered = self._tokenizer.apply_chat_template(
+            turns, tokenize=False, add_generation_prompt=True, enable_thinking=False
+        )
+        return str(rendered)
 
     def unknown_words(self, text: str) -> frozenset[str]:
         unknown = self._tokenizer.unk_token_id
@@ -447,6 +477,16 @@ def _context_of(model: Any) -> int | None:
     """Return the longest sequence of a model, None if its configuration has no limit. A model with images has it for texts."""
     longest = getattr(model.config.get_text_config(), "max_position_embeddings", None)
     return None if longest is None else int(longest)
+
+
+def attention_window(model: Any) -> int | None:
+    """Return the number of tokens that some layers of a model attend to, None if all attend to all."""
+    config = model.config.get_text_config()
+    window, kinds = getattr(config, "sliding_window", None), getattr(config, "layer_types", None)
+    is_off = getattr(config, "use_sliding_window", True) is False
+    if window is None or is_off or (kinds is not None and "sliding_attention" not in kinds):
+        return None
+    return int(window)
 
 
 def _end_tokens(model: Any, tokenizer: Any) -> list[int]:

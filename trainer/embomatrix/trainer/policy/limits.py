@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.skills.episode_text import opening
 from embomatrix.skills.prompt import Codec, Prompt, limited, prompt_for, ranked_rows, subset
 from embomatrix.skills.syntax import Skill
 from embomatrix.trainer.config.errors import TrainerError
@@ -161,8 +162,11 @@ def with_limits(settings: TrainSettings, policy: Policy, tasks: TaskSet) -> Trai
 
     ``prompt.rows``: the fewest rows that hold the objects of every plan. ``grpo.max_new``: the longest plan in tokens times
     ``MARGIN``, at most what the longest prompt leaves of the model's context. Without oracle plans, settings keep their
-    defaults. Raises TrainerError if a prompt leaves no room for a plan.
+    defaults. In episodes nothing follows from them. Raises TrainerError if a prompt leaves no room for a plan or an answer.
     """
+    if settings.episodes.visibility is not None:
+        check_openings(settings.episodes.answer_tokens, Ruler.of_policy(policy), tasks)
+        return settings
     return with_measured_limits(settings, Ruler.of_policy(policy), tasks)
 
 
@@ -180,6 +184,23 @@ def with_measured_limits(settings: TrainSettings, ruler: Ruler, tasks: TaskSet) 
         settings = settings.model_copy(update={"grpo": settings.grpo.model_copy(update={"max_new": max_new})})
     check_context(prompts, settings.grpo.max_new, ruler, "grpo.max_new")
     return settings
+
+
+def check_openings(answer_tokens: int, ruler: Ruler, tasks: TaskSet) -> None:
+    """Raise TrainerError if an episode's opening that tells of all objects leaves no room for an answer."""
+    if ruler.context is None:
+        return
+    openings = {
+        task.task.task_id: opening(task.situation, ruler.codec, seen=False, at_once=1)
+        for task in (*tasks.train, *tasks.heldout)
+    }
+    task_id, tokens = _longest(openings, ruler)
+    if tokens + answer_tokens >= ruler.context:
+        raise TrainerError(
+            f"the opening of an episode of the task {task_id!r} has {tokens} tokens, and episodes.answer_tokens is "
+            f"{answer_tokens}: both must fit into the model's context of {ruler.context}; lower episodes.answer_tokens, or "
+            "pass a model with a longer context"
+        )
 
 
 def prompts_of(tasks: Iterable[TrainingTask], rows: int, codec: Codec) -> dict[str, Prompt]:

@@ -12,7 +12,7 @@ from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
 from embomatrix.trainer.policy.compute_dtype import torch_dtype
 from embomatrix.trainer.policy.decoder import DecoderShape
-from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.hf import HfPolicy, attention_window
 from embomatrix.trainer.policy.lora import has_adapters
 from embomatrix.trainer.policy.protocol import Policy
 from embomatrix.trainer.policy.tiny import EPISODE_CONTEXT, TinyPolicy
@@ -43,9 +43,7 @@ def is_word_level(model: str) -> bool:
 def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
     """Create the initial policy of a run. Raises TrainerError if the model is unknown or can't be loaded."""
     if not is_word_level(settings.model):
-        model = _language_model(settings.model, settings)
-        model.in_episodes = settings.episodes.visibility is not None
-        return model
+        return _language_model(settings.model, settings)
     if settings.model != TINY:
         check_word_level(settings)
         policy = saved_policy(Path(settings.model), settings)
@@ -125,8 +123,21 @@ def saved_policy(folder: Path, settings: TrainSettings, *, learns: bool = True) 
 
 
 def _language_model(named: str, settings: TrainSettings, adapters: Path | None = None) -> HfPolicy:
-    """Load a Hugging Face model, with new or saved adapters if the settings ask for them."""
+    """Load a Hugging Face model, with new or saved adapters if the settings ask for them. Raises TrainerError."""
     policy = HfPolicy.load(named, settings)
+    in_episodes = settings.episodes.visibility is not None
+    if policy.in_episodes and not in_episodes:
+        raise TrainerError(
+            f"the model in {named} writes the calls of episodes: set episodes.visibility, or pass another --model"
+        )
+    window = attention_window(policy.module)
+    if in_episodes and window is not None and window < (policy.context or window + 1):
+        raise TrainerError(
+            f"the model {named} has layers that attend to the last {window:,} tokens only, fewer than its context of "
+            f"{policy.context or 'any length'}: episodes need layers that attend to all; pass another --model, or leave "
+            "episodes.visibility out"
+        )
+    policy.in_episodes = in_episodes
     if settings.lora.rank:
         policy.adapt(settings.lora, seed=settings.seed, saved=adapters)
     return policy

@@ -27,5 +27,5 @@ def rows_of_episodes(
     generator = torch.Generator(next(iter(policy.parameters())).device).manual_seed(seed)
     if isinstance(policy, HfPolicy):
         return ChatRows(policy, prompts, group, temperature, generator, longest)
-    assert isinstance(policy, TinyPolicy), "a policy of whole plans"
+    assert isinstance(policy, TinyPolicy), "no other policy plays episodes"
     return EpisodeRows(policy, prompts, group, temperature, generator)

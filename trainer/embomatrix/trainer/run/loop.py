@@ -8,7 +8,6 @@ import logging
 import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -134,11 +133,12 @@ class TrainingRun:
             for task in start.tasks.train
             if task.oracle
         ]
-        without_costs = replace(terms, call_cost=0.0, failure_cost=0.0)  # the oracle does not mind them
         identity = {
             "dataset": self._progress.dataset,
             "seed": self._settings.seed,
-            "episodes": asdict(without_costs),
+            "codec": policy.codec.value,
+            "visibility": terms.visibility.value,
+            "calls": [terms.calls_factor, terms.calls_more],
         }
         client = EpisodeClient(self._gateway, terms, policy.codec)
         episodes = oracle_episodes(self._out, identity, planned, client, self._display.playing_oracle)
