@@ -20,7 +20,7 @@ from embomatrix.rpc.trust import tls_context
 from embomatrix.rpc.versions import SPOKEN, Capabilities, agree, capabilities_of, software_version
 from embomatrix.rpc.wire.values import FleetStatus
 
-TIMEOUT_S: Final = 1.0
+TIMEOUT_S: Final = 3.0
 """Timeout of each of the four requests."""
 CERTIFICATE_DAYS: Final = 30
 """`manager init` renews certificates with less than this left."""
