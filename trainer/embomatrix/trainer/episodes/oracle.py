@@ -8,10 +8,10 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from embomatrix.rpc.status import ClusterError
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from embomatrix.trainer.data.tasks import TrainingTask
     from embomatrix.trainer.policy.protocol import Policy
 
+T = TypeVar("T")
 ORACLE_EPISODES: Final = "oracle_episodes.json"
 _FILE_VERSION: Final[Mapping[str, object]] = {"format": FORMAT, "file": 3}
 """Versions of the texts of episodes, and of the files that keep them.
@@ -135,11 +136,7 @@ def oracle_episodes(
     playing = client.run(_play_all(planned, client, progress))
     while not wait([playing], timeout=_REPORT_S).done:
         report(len(progress.outcomes), len(planned))
-    try:
-        result_of(playing)
-    except ExceptionGroup as errors:
-        first = first_of(errors)
-        raise (TrainerError(str(first)) if isinstance(first, ClusterError) else first) from errors
+    result_of_all(playing)
     report(len(planned), len(planned))
     refuse_without_workers(progress.outcomes, "the oracle's episodes")
     if not progress.found:
@@ -151,6 +148,15 @@ def oracle_episodes(
     kept = {task_id: progress.found[task_id] for task_id in in_order if task_id in progress.found}
     write_episodes(path, identity, kept)
     return kept
+
+
+def result_of_all(future: Future[T]) -> T:
+    """Return the result of episodes that are played side by side. Raises TrainerError for the first error of the cluster."""
+    try:
+        return result_of(future)
+    except ExceptionGroup as errors:
+        first = first_of(errors)
+        raise (TrainerError(str(first)) if isinstance(first, ClusterError) else first) from errors
 
 
 async def _play_all(planned: Sequence[PlannedEpisode], client: EpisodeClient, progress: _Progress) -> None:

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from embomatrix.rpc.status import ClusterError
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
 from embomatrix.skills.seeds import training_seed
-from embomatrix.trainer.cluster.gateway import refuse_without_workers, result_of
-from embomatrix.trainer.config.errors import TrainerError, first_of
+from embomatrix.trainer.cluster.gateway import refuse_without_workers
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.episodes.batches import EpisodeBatch, play_batches
 from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, PlannedEpisode
 from embomatrix.trainer.episodes.oracle import (
@@ -27,6 +26,7 @@ from embomatrix.trainer.episodes.oracle import (
     OracleExamples,
     finish,
     read_episodes,
+    result_of_all,
     successful,
     write_episodes,
 )
@@ -176,11 +176,7 @@ class Teacher:
             for batch in played
             for each, episode in zip(batch.batch.planned, batch.episodes, strict=True)
         ]
-        try:
-            finished = result_of(self._client.run(self._finish_all(begun)))
-        except ExceptionGroup as errors:
-            first = first_of(errors)
-            raise (TrainerError(str(first)) if isinstance(first, ClusterError) else first) from errors
+        finished = result_of_all(self._client.run(self._finish_all(begun)))
         refuse_without_workers([each.outcome() for each in finished], f"round {number} of teaching")
         return [(each.task.task.task_id, end) for (each, _), end in zip(begun, finished, strict=True)]
 
