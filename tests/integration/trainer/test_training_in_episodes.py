@@ -24,8 +24,10 @@ from embomatrix.trainer.episodes.client import ClusterEpisode
 from embomatrix.trainer.episodes.oracle import ORACLE_EPISODES
 from embomatrix.trainer.episodes.teacher import TAUGHT_EPISODES, Teacher, TeachingRules
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
+from embomatrix.trainer.lifecycle.stopwatch import Activity
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.evaluations import read_evaluations
+from embomatrix.trainer.logging.outcome import read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.policy.loading import new_policy, saved_policy
 from embomatrix.trainer.policy.playing import plays_episodes
@@ -118,6 +120,9 @@ def test_imitation_of_the_oracle_s_episodes_solves_the_training_tasks(cluster, t
     episodes = json.loads((tmp_path / "run" / ORACLE_EPISODES).read_text())["episodes"]
     assert set(episodes) == {task.task.task_id for task in tasks.train}
     assert all(turns[-1][0] == DONE for _, _, _, *turns in episodes.values())
+    spent = read_outcome(tmp_path / "run").spent_s
+    assert spent[Activity.ORACLE] > 0  # not counted as imitation, whose time `bench first-hour` compares
+    assert spent[Activity.IMITATION] > 0
     evaluation = read_evaluations(tmp_path / "run")[-1]
     assert all(answer.verdict.success for answer in evaluation.answers)
     assert json.loads(evaluation.answers[0].text)[-1] == DONE

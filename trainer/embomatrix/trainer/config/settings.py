@@ -207,10 +207,12 @@ class PromptSettings(_Frozen):
 
     If it is not given, a new run takes the fewest rows that hold the objects of every oracle plan for training.
     """
-    rename_share: float = Field(default=0.8, ge=0, le=1)
-    """Share of imitation examples with renamed object categories (word-level policy only)."""
+    rename_share: float = Field(default=0.0, ge=0, le=1)
+    """Share of imitation examples with renamed object categories (word-level policy only). The default keeps the tasks' own
+    words.
+    """
     practice_rename_share: float = Field(default=0.0, ge=0, le=1)
-    """The same share in GRPO. The default keeps the tasks' own words."""
+    """The same share in GRPO."""
     drop_share: float = Field(default=0.7, ge=0, le=1)
     """Imitation leaves out up to this share of the rows that the oracle plan does not use."""
 
@@ -424,7 +426,6 @@ class TrainSettings(_Frozen):
 SERVER_TRUNCATE_RATIO: Final = 2.0
 """Default of ``grpo.truncate_ratio`` with a model server, whose arithmetic differs from the trainer's."""
 LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
-    "prompt.rename_share": 0.0,
     "imitation.batch": 4,
     "imitation.chunk": 1,
     "imitation.optimiser": "adamw",
@@ -434,8 +435,7 @@ LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "grpo.learning_rate": 1e-5,
     "grpo.zero_variance": "keep",
 }
-"""Defaults that differ for a pretrained model: it already knows words, it needs more memory, and TRL's updates keep
-zero-variance groups."""
+"""Defaults that differ for a pretrained model: it needs more memory, and TRL's updates keep zero-variance groups."""
 
 
 def read_settings(

@@ -9,6 +9,7 @@ from enum import StrEnum
 
 
 class Activity(StrEnum):
+    ORACLE = "the oracle's episodes"
     IMITATION = "imitation"
     EVALUATION = "evaluation"
     SAMPLING = "sampling"

@@ -141,7 +141,8 @@ class TrainingRun:
             "calls": [terms.calls_factor, terms.calls_more],
         }
         client = EpisodeClient(self._gateway, terms, policy.codec)
-        episodes = oracle_episodes(self._out, identity, planned, client, self._display.playing_oracle)
+        with self._stopwatch.track(Activity.ORACLE):
+            episodes = oracle_episodes(self._out, identity, planned, client, self._display.playing_oracle)
         examples = OracleExamples(episodes, policy, start.tasks.train)
         self._display.played_oracle(len(examples.tasks), len(planned))
         rules = TeachingRules.of(self._settings, terms)
@@ -155,14 +156,10 @@ class TrainingRun:
     def _prepare(self, workers: DataParallelWorkers) -> None:
         """Run imitation and the first evaluation, and save the reference policy."""
         policy, progress = self._start.policy, self._progress
+        oracle, teacher = self._oracle_and_teacher(workers)
         with self._stopwatch.track(Activity.IMITATION):
             run_imitation(
-                self._start,
-                workers,
-                self._out,
-                self._recorder,
-                self._display.imitation,
-                *self._oracle_and_teacher(workers),
+                self._start, workers, self._out, self._recorder, self._display.imitation, oracle, teacher
             )
         self._publish()
         before = self._evaluate(BEFORE, self._settings.evaluation.samples, workers)
