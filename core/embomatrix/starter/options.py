@@ -18,16 +18,26 @@ DatasetFolder = Annotated[
     Path, typer.Option("--dataset", help="Folder of the dataset.", envvar=DATASET_VARIABLE)
 ]
 """Dataset of a command; the default is ``DEFAULT_DATASET``."""
+DatasetOrName = Annotated[
+    Path,
+    typer.Option(
+        "--dataset",
+        help="Folder of the dataset, or one that ships: starter, search or internal-verified-2.",
+        envvar=DATASET_VARIABLE,
+    ),
+]
+"""Dataset of a factory command that changes none; the default is ``DEFAULT_DATASET``. ``shipped.open_dataset`` opens it."""
 DatasetOrShipped = Annotated[
     Path | None,
     typer.Option(
         "--dataset",
-        help=f"Folder of the dataset. Default: {DEFAULT_DATASET}, or the shipped tasks if there is none.",
+        help="Folder of the dataset, or one that ships: starter, search or internal-verified-2. "
+        f"Default: {DEFAULT_DATASET}, or starter if there is none.",
         envvar=DATASET_VARIABLE,
         show_default=False,
     ),
 ]
-"""Dataset of a command for one person; the default None stands for ``shipped.dataset_folder``."""
+"""Dataset of a command for one person; the default None stands for ``shipped.dataset_folder``. ``open_dataset`` opens it."""
 
 
 def default_dataset() -> Path:

@@ -103,3 +103,10 @@ def test_variable_names_the_dataset_and_the_option_comes_before_it(tmp_path: Pat
         assert (found.returncode, "/no/such" in found.stderr) == (2, True), line
         found = run(f"{line} --dataset /nor/that", **{DATASET_VARIABLE: "/no/such"})
         assert (found.returncode, "/nor/that" in found.stderr) == (2, True), line
+
+
+@pytest.mark.parametrize(("name", "tasks"), [("internal-verified-2", "100"), ("search", "1,663")])
+def test_commands_that_change_no_dataset_take_one_that_ships_by_its_name(name: str, tasks: str) -> None:
+    done = run(f"factory list --dataset {name} --limit 1")
+    assert done.returncode == 0
+    assert f"tasks 1 to 1 of {tasks}; --page 2 shows more" in done.stdout

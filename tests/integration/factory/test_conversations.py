@@ -55,3 +55,20 @@ def test_parquet_is_read_by_pyarrow_alone(kitchen, tmp_path):
     assert parquet.read_table(table).to_pylist() == [
         json.loads(line) for line in lines.read_text(encoding="utf-8").splitlines()
     ]
+
+
+def test_other_tasks_tell_where_things_usually_are(kitchen, tmp_path):
+    own, other = tmp_path / "own.jsonl", tmp_path / "other.jsonl"
+    written(kitchen, own, "--split=heldout")
+    written(kitchen, other, "--split=heldout", f"--training={kitchen}")
+    assert own.read_bytes() == other.read_bytes()
+    arguments = [
+        "conversations",
+        f"--dataset={kitchen}",
+        f"--out={tmp_path / 'third.jsonl'}",
+        "--training=nowhere",
+    ]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 2
+    assert "nowhere" in refused.output
+    assert not (tmp_path / "third.jsonl").exists()

@@ -6,14 +6,15 @@ from typing import Annotated
 import typer
 
 from embomatrix.envs.rules import Visibility
-from embomatrix.factory.commands.options import Jobs, processes
+from embomatrix.factory.commands.options import Jobs, PlacesLearnedFrom, processes
 from embomatrix.factory.commands.terminal import counter, fail, say, user_errors
 from embomatrix.factory.evaluate.conversations import ConversationForm, conversation_schema, conversations
 from embomatrix.factory.pipeline.export import SUFFIXES, encode_rows
 from embomatrix.host.own_files import Force, prepare_output
 from embomatrix.skills.prompt import Codec
-from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
-from embomatrix.world.dataset import SPLITS, Dataset
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetOrName
+from embomatrix.starter.shipped import open_dataset
+from embomatrix.world.dataset import SPLITS
 from embomatrix.world.whole_file import write_whole
 
 FORMS = (Codec.LINES, Codec.JSON)
@@ -22,7 +23,8 @@ FORMS = (Codec.LINES, Codec.JSON)
 
 def conversations_(
     out: Annotated[Path, typer.Option(help="File to write, .jsonl or .parquet.")],
-    dataset: DatasetFolder = DEFAULT_DATASET,
+    dataset: DatasetOrName = DEFAULT_DATASET,
+    training: PlacesLearnedFrom = None,
     split: Annotated[str, typer.Option(help="train or heldout.")] = "train",
     visibility: Annotated[
         Visibility, typer.Option(help="full: the whole table of the task. seen: what the robot has seen.")
@@ -46,12 +48,12 @@ def conversations_(
     prepare_output("factory conversations", out)
     with user_errors(out):
         encode_rows([], out.suffix, conversation_schema)  # pyarrow is missing now, or not at all
-        found = Dataset.load(dataset)
+        found = open_dataset(dataset)
+        learned = found if training is None else open_dataset(training)
         records = [record for record in found.records if record.split == split]
         with counter("tasks", len(records)) as count:
-            rows = conversations(
-                found, records, ConversationForm(visibility, codec), jobs=processes(jobs), progress=count
-            )
+            form = ConversationForm(visibility, codec)
+            rows = conversations(found, records, form, learned, jobs=processes(jobs), progress=count)
         write_whole(out, encode_rows(rows, out.suffix, conversation_schema))
     answers = sum(len(row["messages"]) // 2 for row in rows)
     say(f"{len(rows)} of {len(records)} tasks as conversations with {answers} answers: {out}")

@@ -16,9 +16,9 @@ from embomatrix.factory.pipeline.export import dataset_card, encode_rows, export
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.host.own_files import Force, prepare_output
 from embomatrix.host.printable import printable
-from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder, DatasetOrShipped
-from embomatrix.starter.shipped import dataset_folder
-from embomatrix.world.dataset import SPLITS, Dataset, TaskRecord
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetOrName, DatasetOrShipped
+from embomatrix.starter.shipped import open_dataset
+from embomatrix.world.dataset import SPLITS, TaskRecord
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
 
@@ -39,7 +39,7 @@ def list_(
     with user_errors():
         if split not in ("", *SPLITS):
             fail(f"--split {split!r}: expected {' or '.join(SPLITS)}")
-        records = Dataset.load(dataset_folder(dataset)).records
+        records = open_dataset(dataset).records
     found = list(_selected(records, split, scene, category, search))
     if as_json:
         typer.echo(json.dumps([_in_json(record) for record in found], indent=1))
@@ -104,13 +104,13 @@ def _show_position(found: int, all_: int, page: int, limit: int, shown: int) -> 
 
 def prompts(
     out: Annotated[Path, typer.Option(help="Text file to write.")],
-    dataset: DatasetFolder = DEFAULT_DATASET,
+    dataset: DatasetOrName = DEFAULT_DATASET,
     tasks: Annotated[int, typer.Option(min=1, help="Number of held-out tasks.")] = 40,
 ) -> None:
     """Write the prompts of held-out tasks, without their goals, for a person or a model to answer."""
     prepare_output("factory prompts", out)
     with user_errors(out):
-        write_whole(out, prompts_of(Dataset.load(dataset), tasks).encode("utf-8"))
+        write_whole(out, prompts_of(open_dataset(dataset), tasks).encode("utf-8"))
     say(f"prompts: {out}; `factory evaluate readings` judges the answers")
 
 
@@ -119,13 +119,13 @@ def export(
         Path,
         typer.Option(help="File to write, .jsonl or .parquet. The card, README.md, is written beside it."),
     ],
-    dataset: DatasetFolder = DEFAULT_DATASET,
+    dataset: DatasetOrName = DEFAULT_DATASET,
     force: Force = False,
 ) -> None:
     """Export a dataset for other tools, one row per task, with a dataset card."""
     card = out.with_name("README.md")
     with user_errors(out):
-        found = Dataset.load(dataset)
+        found = open_dataset(dataset)
         data = encode_rows(export_rows(found), out.suffix)
         exported = card.exists() and is_card_of(card.read_text(encoding="utf-8", errors="replace"), out.name)
         foreign = [path for path in (card, out) if path.exists() and not exported]

@@ -16,12 +16,12 @@ from embomatrix.factory.evaluate.faithfulness import (
 )
 from embomatrix.factory.evaluate.verification import sampled
 from embomatrix.host.own_files import prepare_output
-from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
-from embomatrix.world.dataset import Dataset
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetOrName
+from embomatrix.starter.shipped import open_dataset
 
 
 def audit(
-    dataset: DatasetFolder = DEFAULT_DATASET,
+    dataset: DatasetOrName = DEFAULT_DATASET,
     plans: Annotated[int, typer.Option(min=0, help="Plans to try for each task.")] = 200,
     answers: Annotated[
         Path | None,
@@ -42,13 +42,14 @@ def audit(
     """
     prepare_output("factory audit", json_file)
     with user_errors():
-        records = sampled(Dataset.load(dataset).records, sample, seed)
+        found = open_dataset(dataset)
+        records = sampled(found.records, sample, seed)
         if not records:
             fail(f"{dataset} contains no task: name a dataset with tasks")
         given = read_answers(answers) if answers is not None else PolicyAnswers()
         with counter("tasks", len(records)) as count:
             audits = audit_dataset(
-                dataset, records, plans=plans, answers=given, jobs=processes(jobs), progress=count
+                found.folder, records, plans=plans, answers=given, jobs=processes(jobs), progress=count
             )
     for line in objections(audits):
         say(line)

@@ -11,7 +11,7 @@ from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
 from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign, prepare_output
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder, DatasetOrShipped
-from embomatrix.starter.shipped import dataset_folder
+from embomatrix.starter.shipped import open_dataset
 from embomatrix.world.dataset import Dataset, bundle_file
 from embomatrix.world.json_text import parse_json
 from embomatrix.world.whole_file import write_whole
@@ -32,7 +32,7 @@ def inspect(
     """Write a task as one HTML file: instruction, transcript, layout, objects, and the oracle's plan step by step."""
     file = out or Path(f"{task}.html")
     with user_errors(file):
-        loaded = Dataset.load(dataset_folder(dataset))
+        loaded = open_dataset(dataset)
         record = loaded.find(task)
         if out is None:
             keep_foreign("", [file], PAGE_MARK, force=force)

@@ -1,6 +1,7 @@
 """Options shared by commands of the factory."""
 
 import os
+from pathlib import Path
 from typing import Annotated, Final
 
 import typer
@@ -26,6 +27,14 @@ Physical = Annotated[
     typer.Option(
         "--physical/--no-physical",
         help="Admit a task only if a robot carries its plan out in stepped physics. Default: same as --reachability.",
+    ),
+]
+PlacesLearnedFrom = Annotated[
+    Path | None,
+    typer.Option(
+        "--training",
+        help="Dataset whose training tasks tell where things usually are, as a folder or by its name if it ships. "
+        "Default: the dataset itself.",
     ),
 ]
 MOST_JOBS: Final = 8

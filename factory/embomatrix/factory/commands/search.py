@@ -6,25 +6,20 @@ from typing import Annotated
 
 import typer
 
-from embomatrix.factory.commands.options import Jobs, processes
+from embomatrix.factory.commands.options import Jobs, PlacesLearnedFrom, processes
 from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
 from embomatrix.factory.evaluate.search import search_tasks, searches
 from embomatrix.host.own_files import Force, keep_foreign, prepare_output
-from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
-from embomatrix.starter.shipped import FROZEN_MARK, freeze
-from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, write_dataset
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetOrName
+from embomatrix.starter.shipped import FROZEN_MARK, freeze, open_dataset
+from embomatrix.world.dataset import SPLITS, TASKS_FILE, write_dataset
 from embomatrix.world.task import TaskCategory
 
 
 def search(
     out: Annotated[Path, typer.Option(help="New folder for the selected tasks.")],
-    dataset: DatasetFolder = DEFAULT_DATASET,
-    training: Annotated[
-        Path | None,
-        typer.Option(
-            help="Dataset whose training tasks tell where things usually are. Default: the dataset itself."
-        ),
-    ] = None,
+    dataset: DatasetOrName = DEFAULT_DATASET,
+    training: PlacesLearnedFrom = None,
     split: Annotated[str, typer.Option(help="Select from this split only, train or heldout.")] = "",
     frozen: Annotated[
         Path | None, typer.Option("--freeze", help="Write the ids of the selected tasks to this file.")
@@ -49,9 +44,9 @@ def search(
         keep_foreign("factory search", [frozen], FROZEN_MARK, force=force)
         prepare_output("factory search", frozen)
     with user_errors(out):
-        found = Dataset.load(dataset)
+        found = open_dataset(dataset)
         records = [record for record in found.records if split in ("", record.split)]
-        learned = found if training is None else Dataset.load(training)
+        learned = found if training is None else open_dataset(training)
         with counter("tasks", len(records)) as count:
             results = search_tasks(found, records, learned, jobs=processes(jobs), progress=count)
         chosen = searches(records, results)

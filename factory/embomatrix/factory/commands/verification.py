@@ -9,8 +9,8 @@ from embomatrix.factory.commands.options import Jobs, processes
 from embomatrix.factory.commands.terminal import counter, fail, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.verification import evaluation_of, objections, sampled, verify_again
 from embomatrix.host.own_files import prepare_output
-from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
-from embomatrix.world.dataset import Dataset
+from embomatrix.starter.options import DEFAULT_DATASET, DatasetOrName
+from embomatrix.starter.shipped import open_dataset
 
 Physical = Annotated[
     bool,
@@ -21,7 +21,7 @@ Figures = Annotated[Path | None, typer.Option("--json", help="File for the figur
 
 
 def verify(
-    dataset: DatasetFolder = DEFAULT_DATASET,
+    dataset: DatasetOrName = DEFAULT_DATASET,
     physical: Physical = False,
     sample: Sample = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sample.")] = 0,
@@ -34,11 +34,14 @@ def verify(
     """
     prepare_output("factory verify", json_file)
     with user_errors():
-        records = sampled(Dataset.load(dataset).records, sample, seed)
+        found = open_dataset(dataset)
+        records = sampled(found.records, sample, seed)
         if not records:
             fail(f"{dataset} contains no task: name a dataset with tasks")
         with counter("judgements", 2 * len(records)) as count:
-            verdicts = verify_again(dataset, records, physical=physical, jobs=processes(jobs), progress=count)
+            verdicts = verify_again(
+                found.folder, records, physical=physical, jobs=processes(jobs), progress=count
+            )
     conditions = {"dataset": dataset.name, "tasks": len(verdicts), "seed": seed}
     for line in objections(verdicts):
         say(line)

@@ -35,16 +35,17 @@ def conversations(
     dataset: Dataset,
     records: Sequence[TaskRecord],
     form: ConversationForm,
+    learned: Dataset,
     *,
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> list[Row]:
     """Return a row for each task that the script solves, in the order of the records.
 
-    The script learns from the dataset's training tasks where things usually are. ``messages`` of a row are a chat. Raises
+    The script learns from the training tasks of ``learned`` where things usually are. ``messages`` of a row are a chat. Raises
     DatasetError if a bundle can't be read or a process dies.
     """
-    priors = PlacePriors(situations_of(dataset, dataset.train).values())
+    priors = PlacePriors(situations_of(learned, learned.train).values())
     groups, work = list(by_bundle(records).values()), partial(_talk, dataset.folder, priors, form)
     rows: dict[str, Row] = {}
     done = 0
