@@ -17,6 +17,7 @@ import numpy as np
 from embomatrix.scripts.searching import PlacePriors
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.starter.shipped import open_dataset
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.data.tasks import read_tasks
 from embomatrix.trainer.eai.exam import NAME as NATIVE
@@ -163,6 +164,6 @@ def written_baseline(
 
 def _training_tasks(folder: Path) -> Dataset:
     try:
-        return Dataset.load(folder)
-    except DatasetError as error:
+        return open_dataset(folder)
+    except (DatasetError, OSError) as error:
         raise TrainerError(str(error)) from error

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 import typer
+from tests.fakes.datasets import write_kitchen_dataset
 
+from embomatrix.factory.evaluate.scripts import held_out_of
 from embomatrix.starter.options import DATASET_VARIABLE
 
 MEASURED = {
@@ -110,3 +112,8 @@ def test_commands_that_change_no_dataset_take_one_that_ships_by_its_name(name: s
     done = run(f"factory list --dataset {name} --limit 1")
     assert done.returncode == 0
     assert f"tasks 1 to 1 of {tasks}; --page 2 shows more" in done.stdout
+
+
+def test_other_training_tasks_are_taken_by_name_too(tmp_path: Path) -> None:
+    _, learned, _ = held_out_of(write_kitchen_dataset(tmp_path), Path("search"))
+    assert len(learned.train) == 1512

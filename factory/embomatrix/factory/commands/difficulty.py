@@ -19,6 +19,7 @@ from embomatrix.factory.evaluate.difficulty import (
 from embomatrix.factory.evaluate.scripts import ScriptResults, run_scripts, write_plans
 from embomatrix.host.own_files import Force
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
+from embomatrix.starter.shipped import open_dataset
 from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, TaskRecord, encode_records, write_dataset
 from embomatrix.world.difficulty import DifficultyLevel
 from embomatrix.world.whole_file import write_whole
@@ -29,7 +30,8 @@ def difficulty(
     training: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset whose training tasks the scripts learn from. Default: the dataset itself."
+            help="Dataset whose training tasks the scripts learn from, as a folder or by its name if it ships. "
+            "Default: the dataset itself."
         ),
     ] = None,
     policy: Annotated[
@@ -72,7 +74,7 @@ def difficulty(
         shares_of_policy = read_policy_shares(policy) if policy is not None else {}
         found = Dataset.load(dataset)
         missing = [record for record in found.records if again or record.difficulty is None]
-        results = script_results(found, missing, found if training is None else Dataset.load(training), jobs)
+        results = script_results(found, missing, found if training is None else open_dataset(training), jobs)
         records = with_policy(with_scripts(found.records, results), shares_of_policy)
         write_whole(dataset / TASKS_FILE, encode_records(records))
         _print_levels(records)

@@ -74,7 +74,10 @@ def evaluate(
     ] = None,
     training: Annotated[
         Path | None,
-        typer.Option(help="Dataset whose training tasks the scripts learn from. Default: the same dataset."),
+        typer.Option(
+            help="Dataset whose training tasks the scripts learn from, as a folder or by its name if it ships. "
+            "Default: the same dataset."
+        ),
     ] = None,
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
     sample: Annotated[

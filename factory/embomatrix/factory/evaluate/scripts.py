@@ -19,6 +19,7 @@ from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.prompt import Situation, situation_of
 from embomatrix.skills.syntax import Plan
+from embomatrix.starter.shipped import open_dataset
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
 
 
@@ -176,7 +177,7 @@ def held_out_of(folder: Path, training: Path | None) -> tuple[Dataset, Dataset, 
     Raises EvaluationError for a dataset without held-out tasks.
     """
     dataset = Dataset.load(folder)
-    learned = dataset if training is None else Dataset.load(training)
+    learned = dataset if training is None else open_dataset(training)
     if not dataset.heldout:
         raise EvaluationError(f"{folder} has no held-out tasks: build it with --heldout")
     conditions: dict[str, str | int] = {
