@@ -55,3 +55,9 @@ def test_every_command_on_the_page_exists_with_its_options(page: Path) -> None:
 
 def test_pages_show_commands() -> None:
     assert sum(len(shown(page.read_text(encoding="utf-8"))) for page in PAGES) > 40
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_extra_stands_in_a_pattern_of_files(page: Path) -> None:
+    # A shell takes [worker] behind a star for one of these letters, finds no such file, and hands the pattern to pip.
+    assert not re.findall(r"pip install [^\n`\"']*\*\S*\[\w[^\n`]*", page.read_text(encoding="utf-8"))
