@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from embomatrix.factory.commands.options import Jobs, processes
+from embomatrix.factory.commands.options import Jobs, ScriptsLearnFrom, processes
 from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
 from embomatrix.factory.evaluate.difficulty import (
     level_counts,
@@ -27,13 +27,7 @@ from embomatrix.world.whole_file import write_whole
 
 def difficulty(
     dataset: DatasetFolder = DEFAULT_DATASET,
-    training: Annotated[
-        Path | None,
-        typer.Option(
-            help="Dataset whose training tasks the scripts learn from, as a folder or by its name if it ships. "
-            "Default: the dataset itself."
-        ),
-    ] = None,
+    training: ScriptsLearnFrom = None,
     policy: Annotated[
         Path | None,
         typer.Option(help="report.json of `embomatrix eval` for a small policy on the dataset's tasks."),

@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Llm, Model, Tape, chat_model
-from embomatrix.factory.commands.options import Seed
+from embomatrix.factory.commands.options import ScriptsLearnFrom, Seed
 from embomatrix.factory.commands.terminal import counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics_fit import evaluate_aesthetics
@@ -72,13 +72,7 @@ def evaluate(
             "writers; for scripts, search, skills and readings: the shipped dataset."
         ),
     ] = None,
-    training: Annotated[
-        Path | None,
-        typer.Option(
-            help="Dataset whose training tasks the scripts learn from, as a folder or by its name if it ships. "
-            "Default: the same dataset."
-        ),
-    ] = None,
+    training: ScriptsLearnFrom = None,
     each: Annotated[int, typer.Option(min=2, help="Tasks per scene (10 in the paper).")] = 10,
     sample: Annotated[
         Path | None,

@@ -37,6 +37,14 @@ PlacesLearnedFrom = Annotated[
         "Default: the dataset itself.",
     ),
 ]
+ScriptsLearnFrom = Annotated[
+    Path | None,
+    typer.Option(
+        "--training",
+        help="Dataset whose training tasks the scripts learn from, as a folder or by its name if it ships. "
+        "Default: the dataset itself.",
+    ),
+]
 MOST_JOBS: Final = 8
 """Upper limit of the default: each process holds some hundred MB of scenes."""
 Jobs = Annotated[
