@@ -9,10 +9,10 @@ from embomatrix.bench.first_hour.record import (
     RECORD,
     Arm,
     SeedRun,
+    add_to_record,
     comparison,
     figures_of,
     read_record,
-    write_record,
 )
 from embomatrix.bench.first_hour.seeds import curve_digest
 from embomatrix.bench.report.figures import BenchError
@@ -46,12 +46,21 @@ def test_no_seed_has_no_figures() -> None:
 
 def test_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "record.json"
-    write_record(path, [seed(1, 7), seed(0, 12)])
+    add_to_record(path, [seed(1, 7), seed(0, 12)])
     assert read_record(path) == (seed(0, 12), seed(1, 7))
     assert read_record(tmp_path / "none.json") == ()
     path.write_text('[{"seed": 0}]')
     with pytest.raises(BenchError, match="is no record of the demo's seeds"):
         read_record(path)
+
+
+def test_record_keeps_seeds_of_the_same_tasks(tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    add_to_record(path, [seed(1, 7), seed(0, 12)])
+    assert add_to_record(path, [seed(2, 5), seed(1, 9)]) == [seed(0, 12), seed(1, 9), seed(2, 5)]
+    assert add_to_record(path, []) == list(read_record(path)) == [seed(0, 12), seed(1, 9), seed(2, 5)]
+    other = replace(seed(2, 5), dataset="d2")
+    assert add_to_record(path, [other]) == [other]
 
 
 def test_shipped_record_is_readable() -> None:

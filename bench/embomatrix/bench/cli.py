@@ -164,12 +164,16 @@ def first_hour(
             help="Seeds of `make run`, each with GRPO and with imitation that goes on for as long. 0: none.",
         ),
     ] = 1,
+    first: Annotated[int, typer.Option(min=0, help="The first seed; the others follow it.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the runs; finished ones are kept.")] = Path(
         "build/first_hour"
     ),
     record: Annotated[
         Path | None,
-        typer.Option(help="File for the seeds. Default: they are held against the recorded ones."),
+        typer.Option(
+            help="File that the seeds are added to; the figures are about all in it. "
+            "Default: the seeds are held against the recorded ones."
+        ),
     ] = None,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps of GRPO, if not those of `make run`.")
@@ -182,8 +186,8 @@ def first_hour(
 
     A seed takes about half an hour on two cores.
     """
-    from embomatrix.bench.first_hour.record import comparison, figures_of, read_record, write_record
-    from embomatrix.bench.first_hour.seeds import run_seed
+    from embomatrix.bench.first_hour.record import add_to_record, comparison, figures_of, read_record
+    from embomatrix.bench.first_hour.seeds import run_seeds
     from embomatrix.bench.first_hour.wheel import measure_wheel
 
     given = {"steps": steps, "imitate-steps": imitate_steps}
@@ -192,11 +196,10 @@ def first_hour(
     notes: list[str] = []
 
     def measure(on_step: OnStep) -> Sequence[Figure]:
-        runs = [run_seed(seed, out, budget, on_step) for seed in range(seeds)]
-        if record is not None:
-            write_record(record, runs)
+        runs = run_seeds(range(first, first + seeds), out, budget, on_step)
         notes.extend(comparison(known[run.seed], run) for run in runs if run.seed in known and not budget)
-        figures = list(figures_of(runs)) if runs else []
+        told = runs if record is None else add_to_record(record, runs)
+        figures = list(figures_of(told)) if told else []
         if Path("pyproject.toml").exists():
             figures.append(measure_wheel(Path(), on_step))
         else:

@@ -21,9 +21,9 @@ from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 
 DEFAULT_OUT: Final = Path("runs/demo")
 IMITATION_STEPS: Final = 340
-GRPO_STEPS: Final = 180
+GRPO_STEPS: Final = 90
 """Budgets in steps: the same seed gives the same curve on a fast machine and on a slow one."""
-EVALUATE_EVERY: Final = 90
+EVALUATE_EVERY: Final = 45
 """Steps of GRPO between evaluations: one beside those before and after, in twenty seconds."""
 console = Console()
 

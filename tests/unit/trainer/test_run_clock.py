@@ -104,4 +104,4 @@ def test_demo_takes_the_minutes_that_the_readme_says():
     assert evaluations_during(settings, GRPO_STEPS) == 1
     assert evaluations_during(EvaluationSettings(every=70), 420, begun_at=141) == 3
     assert evaluations_during(EvaluationSettings(), GRPO_STEPS) == 0
-    assert 16 < typical_seconds(IMITATION_STEPS, GRPO_STEPS, 200 * (2 * 10 + 1 * 4)) / 60 <= 17
+    assert 10 < typical_seconds(IMITATION_STEPS, GRPO_STEPS, 200 * (2 * 10 + 1 * 4)) / 60 <= 11

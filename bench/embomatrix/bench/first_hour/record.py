@@ -52,15 +52,19 @@ class SeedRun:
         return paired_difference(self.continued.rates, self.trained.rates)
 
 
-def write_record(path: Path, seeds: Sequence[SeedRun]) -> None:
-    """Write seeds in their order. Raise OSError."""
-    values = [asdict(seed) for seed in sorted(seeds, key=lambda each: each.seed)]
+def add_to_record(path: Path, seeds: Sequence[SeedRun]) -> Sequence[SeedRun]:
+    """Add seeds to those that a file holds of the same tasks, and return all in their order. Raise BenchError and OSError."""
+    tasks = {seed.dataset for seed in seeds}
+    kept = {seed.seed: seed for seed in read_record(path) if not tasks or seed.dataset in tasks}
+    merged = kept | {seed.seed: seed for seed in seeds}
+    ordered = [merged[number] for number in sorted(merged)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, (json.dumps(values, indent=1) + "\n").encode("ascii"))
+    write_whole(path, (json.dumps([asdict(seed) for seed in ordered], indent=1) + "\n").encode("ascii"))
+    return ordered
 
 
 def read_record(path: Path = RECORD) -> tuple[SeedRun, ...]:
-    """Read what `write_record` wrote; none if there is no file. Raise BenchError for any other content."""
+    """Read what `add_to_record` wrote; none if there is no file. Raise BenchError for any other content."""
     if not path.exists():
         return ()
     try:

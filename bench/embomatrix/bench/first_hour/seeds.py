@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
-import resource
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,20 +33,40 @@ TIMES: Final = frozenset({"seconds", "spent_s"})
 """Figures of a step that no other run repeats."""
 
 
-def run_seed(seed: int, folder: Path, options: Mapping[str, int], on_step: OnStep) -> SeedRun:
-    """Run both arms of a seed, or read those that have finished. ``options`` are budgets for `embomatrix demo`.
+def run_seeds(
+    seeds: Sequence[int], folder: Path, options: Mapping[str, int], on_step: OnStep
+) -> Sequence[SeedRun]:
+    """Run both arms of each seed, or read those that have finished. ``options`` are budgets for `embomatrix demo`.
 
-    Imitation goes on for as many steps as take the time of GRPO. Raise BenchError if a run fails.
+    Imitation goes on for as many steps as take the time of GRPO. Runs with GRPO have the machine for themselves, because their
+    time is measured. Imitation takes one core, so these runs share the machine. Raise BenchError if a run fails.
     """
-    trained = _arm(folder / f"seed-{seed}-grpo", seed, options, on_step)
+    trained = [_arm(folder / f"seed-{seed}-grpo", seed, options, on_step) for seed in seeds]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        arms = [
+            pool.submit(_arm, folder / f"seed-{seed}-imitation", seed, _as_long(arm, options), on_step)
+            for seed, arm in zip(seeds, trained, strict=True)
+        ]
+        try:
+            continued = [arm.result() for arm in arms]
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return [_read_seed(*each) for each in zip(seeds, trained, continued, strict=True)]
+
+
+def _as_long(trained: Path, options: Mapping[str, int]) -> Mapping[str, int]:
+    """Return budgets of imitation alone that takes as long as a run with GRPO did."""
     outcome = read_outcome(trained)
     further = round(outcome.imitation_steps * outcome.grpo_s / outcome.spent_s[Activity.IMITATION])
-    steps = {"imitate-steps": outcome.imitation_steps + further, "steps": 0}
-    continued = _arm(folder / f"seed-{seed}-imitation", seed, {**options, **steps}, on_step)
+    return {**options, "imitate-steps": outcome.imitation_steps + further, "steps": 0}
+
+
+def _read_seed(seed: int, trained: Path, continued: Path) -> SeedRun:
     newest = newest_checkpoint(trained)
     if newest is None:
         raise BenchError(f"{trained} has no checkpoint: remove it, and run the command again")
     progress, _ = read_state(newest)
+    outcome = read_outcome(trained)
     return SeedRun(
         seed=seed,
         dataset=progress.dataset,
@@ -83,23 +104,20 @@ def _arm(out: Path, seed: int, options: Mapping[str, int], on_step: OnStep) -> P
     out.parent.mkdir(parents=True, exist_ok=True)
     given = [f"--{name}={value}" for name, value in options.items()]
     where = [f"--out={out}", f"--dataset={out.parent / 'dataset'}"]
-    began, spent = time.monotonic(), _children_s()
+    began = time.monotonic()
     with log.open("wb") as file:
         command = [sys.executable, "-m", "embomatrix.cli", "demo", f"--seed={seed}", *where, *given]
-        done = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, check=False)
-    if done.returncode or not (out / OUTCOME).exists():
+        with subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT) as started:
+            # Tells what this run and its processes used, whatever runs beside it.
+            _, status, used = os.wait4(started.pid, 0)
+            started.returncode = os.waitstatus_to_exitcode(status)
+    if started.returncode or not (out / OUTCOME).exists():
         raise BenchError(
-            f"the demo of seed {seed} ended with status {done.returncode}: read {log}, and run the command again"
+            f"the demo of seed {seed} ended with status {started.returncode}: read {log}, and run the command again"
         )
-    cost = {"wall_s": time.monotonic() - began, "core_s": _children_s() - spent}
+    cost = {"wall_s": time.monotonic() - began, "core_s": used.ru_utime + used.ru_stime}
     (out / COST).write_text(json.dumps(cost), encoding="ascii")
     return out
-
-
-def _children_s() -> float:
-    """CPU seconds of all processes that ended below this one."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _read_arm(folder: Path, outcome: RunOutcome) -> Arm:
