@@ -134,7 +134,7 @@ def their_loss(case, folder, kind, level, kl_coef):
 def test_loss_and_gradient_equal_those_of_trl(case, tmp_path, kind, level, kl_coef):
     theirs = their_loss(case, tmp_path, kind, level, kl_coef)
     their_gradient = case.gradient(theirs)
-    inputs = LossInputs(case.logprobs(), case.old, case.mask, case.advantages, case.reference)
+    inputs = LossInputs(case.logprobs(), case.old, case.mask, case.advantages[:, None], case.reference)
     settings = GrpoSettings(loss=kind, ratio=level, clip_low=0.2, clip_high=0.28, kl_coef=kl_coef)
     totals = LossTotals(TASKS * GROUP, int(case.mask.sum()), LENGTH)
     ours, _ = surrogate_loss(inputs, settings, totals)

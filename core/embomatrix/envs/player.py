@@ -6,7 +6,7 @@ what happened. It keeps the rules; the simulator knows nothing of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.episode_text import left_out, not_an_action
 from embomatrix.skills.parse import PlanError, parse_answer
 from embomatrix.skills.prompt import Codec, with_indices
+from embomatrix.skills.syntax import Skill
 
 if TYPE_CHECKING:
     from embomatrix.reward.turns import RunningEpisode, Turn
@@ -65,6 +66,7 @@ class EpisodePlayer:
         self.reward = EpisodeReward(unparsable(reward))
         self._repeated: SkillCall | str = ""
         self._repeats = 0
+        self._way: tuple[SkillCall, ...] = ()
 
     async def begin(self) -> Prompt:
         """Return the opening prompt. Raises what ``RunningEpisode.act`` raises."""
@@ -96,11 +98,21 @@ class EpisodePlayer:
             done = False
         steps, turn = await self._execute(calls[:most])
         self.steps += steps
+        for call in (step.call for step in steps if step.ok):
+            if call.skill in (Skill.MOVE, Skill.GO_TO_ROOM):
+                self._way = (call,)
+            elif call.skill in (Skill.TURN, Skill.MOVE_FORWARD):
+                self._way += (call,)
         self._count(steps, turn, unread=None if steps or done else text)
         observed = turn.observation if turn is not None else None
         told = self.observer.tell(steps, observed, self.reward.calls, notes)
         self.end = self._ending(done=done and all(step.ok for step in steps))
         return Observation(told, tuple(steps), self.reward, self.end)
+
+    @property
+    def state(self) -> Hashable:
+        """State as the policy knows it, and how the robot came to stand where it stands. Earlier calls don't matter."""
+        return self.observer.situation, self._way
 
     async def advise(self) -> Advice:
         """Ask the oracle for a plan from here on, which names objects that the policy may not have seen. Counts as no call.

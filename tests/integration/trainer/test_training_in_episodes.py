@@ -23,6 +23,7 @@ from embomatrix.trainer.episodes import teacher
 from embomatrix.trainer.episodes.client import ClusterEpisode
 from embomatrix.trainer.episodes.oracle import ORACLE_EPISODES
 from embomatrix.trainer.episodes.teacher import TAUGHT_EPISODES, Teacher, TeachingRules
+from embomatrix.trainer.grpo.step_advantages import AnswerStates
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.lifecycle.stopwatch import Activity
 from embomatrix.trainer.logging.display import LineDisplay
@@ -138,9 +139,39 @@ def test_costs_of_calls_are_subtracted_from_the_reward(cluster, tasks, tmp_path)
     assert dear["reward"] == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("kind", ["word-level policy", "language model"])
+def test_each_answer_has_its_step_advantage(cluster, tasks, tmp_path, monkeypatch, kind):
+    changes = {"grpo__steps": 2, "evaluation__samples": 1, "episodes__step_weight": 1.0}
+    if kind == "language model":
+        save_small_llama(tasks.train, tmp_path / "model")
+        changes |= {"model": str(tmp_path / "model"), "codec": "lines", "episodes__answer_tokens": 6}
+    compared = []
+    token_advantages = AnswerStates.token_advantages
+
+    def recorded(states, rewards, advantages, mask, floor):
+        runs = (mask & ~torch.nn.functional.pad(mask, (1, 0))[:, :-1]).sum(dim=1)
+        assert runs.tolist() == [len(answers) for answers in states.states]
+        values = token_advantages(states, rewards, advantages, mask, floor)
+        compared.append(states.step_advantages(rewards, floor))
+        assert not values[~mask].any()
+        return values
+
+    monkeypatch.setattr(AnswerStates, "token_advantages", recorded)
+    first = train(cluster, tasks, tmp_path / "one", **changes)
+    assert len(compared) == 2 * 3  # steps x tasks
+    assert any(values.any() for values in compared)
+    second = train(cluster, tasks, tmp_path / "two", processes=2, **changes)
+    assert torch.equal(weights(first), weights(second))
+    assert not torch.equal(
+        weights(first),
+        weights(train(cluster, tasks, tmp_path / "plain", **{**changes, "episodes__step_weight": 0.0})),
+    )
+
+
 def test_a_turn_without_a_result_loses_the_episode_and_not_the_run():
     class Player:
         end = None
+        state = "start"
 
         async def answer(self, text):
             raise TurnFailedError("three attempts failed", InfraFailure(InfraCode.SLOT_CRASHED, "it crashed"))

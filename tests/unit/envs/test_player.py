@@ -84,6 +84,22 @@ def test_observation_tells_outcome_changes_and_robot():
     assert (failed.reward.calls, failed.reward.failures, failed.end) == (2, 1, None)
 
 
+def state_after(*answers, rules=FULL):
+    return play(answers, rules)[0].state
+
+
+def test_state_is_equal_whatever_led_to_it():
+    assert state_after("open 2", "move 1") == state_after(
+        "move 0", "open 2", "pick_up 3", "nonsense", "move 1"
+    )
+    assert hash(state_after("move 1")) == hash(state_after("move 0", "move 1"))
+    assert state_after("move 1") != state_after("move 0")
+    assert state_after("move 1") != state_after("move 1", "turn 1.5") != state_after("move 1", "turn 0.5")
+    assert state_after("move 1", "turn 1.5", "move 1") == state_after("move 1")
+    assert state_after("open 2") != state_after()
+    assert state_after(rules=SEEN) != state_after()  # knowledge is a part of it
+
+
 def test_only_what_was_seen_is_told_and_may_be_used():
     player, kitchen, prompt, observations = play(["open 2", "move 0", "open 2", "pick_up 3"], SEEN)
     assert "table 0 on: apple 1" in prompt.user

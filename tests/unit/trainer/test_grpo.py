@@ -35,7 +35,7 @@ def inputs(new=NEW, **changes):
         "logprobs": torch.tensor(new, dtype=torch.float64, requires_grad=True),
         "old_logprobs": torch.tensor(OLD, dtype=torch.float64),
         "mask": torch.tensor(MASK),
-        "advantages": torch.tensor(ADVANTAGES, dtype=torch.float64),
+        "advantages": torch.tensor(ADVANTAGES, dtype=torch.float64)[:, None],
         "reference": torch.tensor(REFERENCE, dtype=torch.float64),
     }
     return LossInputs(**{**values, **changes})
@@ -114,7 +114,7 @@ def test_sampler_gap_is_the_difference_of_log_probabilities_over_unmasked_tokens
 
 
 def test_truncated_weights_keep_the_gradient_that_the_clipped_ratio_drops():
-    good = torch.ones(4, dtype=torch.float64)
+    good = torch.ones(4, 1, dtype=torch.float64)
     sampler = torch.tensor(OLD, dtype=torch.float64) - 1  # the policy has become e times as sure
     clipped = inputs(new=OLD, old_logprobs=sampler, reference=None, advantages=good)
     surrogate_loss(clipped, settings_of(), TOTALS)[0].backward()
@@ -156,6 +156,31 @@ def test_microbatches_add_up_to_the_step(kind, ratio):
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
+def test_tokens_with_the_advantage_of_their_plan_have_its_loss(kind, ratio):
+    settings = settings_of(loss=kind, ratio=ratio, kl_coef=0.05)
+    of_plans, of_tokens = inputs(), inputs(advantages=inputs().advantages.expand(4, 2))
+    expected, _ = surrogate_loss(of_plans, settings, TOTALS)
+    found, _ = surrogate_loss(of_tokens, settings, TOTALS)
+    expected.backward()
+    found.backward()
+    assert found.item() == pytest.approx(expected.item(), abs=1e-12)
+    assert torch.allclose(of_tokens.logprobs.grad, of_plans.logprobs.grad)
+
+
+@pytest.mark.parametrize("ratio", RatioLevel)
+def test_each_token_follows_its_own_advantage(ratio):
+    signs = torch.tensor([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
+    start = inputs(new=OLD, reference=None, advantages=signs)
+    surrogate_loss(start, settings_of(ratio=ratio), TOTALS)[0].backward()
+    slopes = -start.logprobs.grad
+    if ratio is RatioLevel.TOKEN:
+        assert torch.equal(torch.sign(slopes)[start.mask], signs[start.mask])
+    else:  # one ratio for the plan: its tokens move by the sum of their advantages
+        assert torch.allclose(slopes[0], torch.zeros(2, dtype=torch.float64))
+        assert (slopes[3] < 0).all()
+
+
+@pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
     start = inputs(new=OLD, reference=None)
     loss, metrics = surrogate_loss(start, settings_of(loss=kind, ratio=ratio), TOTALS)
@@ -169,7 +194,7 @@ def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
 
 
 def test_clipped_ratio_has_no_gradient():
-    far = inputs(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, dtype=torch.float64))
+    far = inputs(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, 1, dtype=torch.float64))
     loss, metrics = surrogate_loss(far, settings_of(), TOTALS)
     loss.backward()
     assert far.logprobs.grad.abs().max() == 0
@@ -188,7 +213,7 @@ def test_lost_rows_have_no_influence():
 
 
 def test_kl_term_pulls_towards_the_reference():
-    part = inputs(new=OLD, advantages=torch.zeros(4, dtype=torch.float64))
+    part = inputs(new=OLD, advantages=torch.zeros(4, 1, dtype=torch.float64))
     loss, metrics = surrogate_loss(part, settings_of(kl_coef=1.0), TOTALS)
     loss.backward()
     own = torch.tensor(MASK)

@@ -41,7 +41,7 @@ def learnt(entropy_coef):
         old_logprobs=samples.logprobs,
         sampler_logprobs=samples.logprobs,
         reference=None,
-        advantages=torch.linspace(-1, 1, PLANS),
+        advantages=torch.linspace(-1, 1, PLANS)[:, None],
         totals=LossTotals(PLANS, int(samples.mask.sum()), 6),
     )
     return policy, learner.learn(microbatch)

@@ -107,7 +107,7 @@ class Trial:
 
 def plans_of(microbatch):
     """Count the plans of a microbatch by prompt, tokens and advantage."""
-    rows = zip(microbatch.tokens, microbatch.mask, microbatch.advantages.tolist(), strict=True)
+    rows = zip(microbatch.tokens, microbatch.mask, microbatch.advantages[:, 0].tolist(), strict=True)
     group = len(microbatch.tokens) // len(microbatch.prompts)
     return Counter(
         (microbatch.prompts[row // group], tuple(tokens[mask].tolist()), advantage)

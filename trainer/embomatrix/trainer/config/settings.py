@@ -139,6 +139,10 @@ class EpisodesTable(_Frozen):
     """Subtracted from an episode's reward for each failed call, besides ``call_cost``."""
     answer_tokens: int = Field(default=64, ge=1)
     """Maximum tokens of a language model's answer. Longer ones are cut off, and what they say up to there is carried out."""
+    step_weight: float = Field(default=0.0, ge=0)
+    """Weight of step advantages in GRPO: of each answer among those in equal states (GiGPO, Feng et al. 2025). 0: none."""
+    step_discount: float = Field(default=0.95, gt=0, le=1)
+    """An answer's return is the episode's reward, discounted by this factor with each answer that follows."""
     teacher_rounds: int = Field(default=0, ge=0, le=100)
     """Rounds of teaching, at equal distances within imitation: the policy begins episodes, the oracle finishes them from
     wherever that led, and what the oracle did is imitated from then on (DAgger, Ross et al. 2011).

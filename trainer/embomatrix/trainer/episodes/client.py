@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Hashable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -48,6 +48,8 @@ class ClusterEpisode:
         """Answers so far."""
         self.told: list[str] = []
         """Texts that were told after the answers."""
+        self.states: list[Hashable] = []
+        """State before each answer."""
         self.begun = 0
         """Answers of the policy before another took over."""
         self.lost: InfraFailure | None = None
@@ -83,6 +85,7 @@ class ClusterEpisode:
     async def answer(self, text: str) -> str:
         """Take an answer and return what the policy is told. Raises ClusterError if the manager can't be reached."""
         self.answers.append(text)
+        self.states.append(self.player.state)
         observation = await self._try(lambda: self.player.answer(text))
         self.told.append("" if observation is None else observation.text)
         return self.told[-1]

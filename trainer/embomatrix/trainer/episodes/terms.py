@@ -24,6 +24,9 @@ class EpisodeTerms:
     failure_cost: float = 0.0
     answer_tokens: int = 64
     """Maximum tokens of a language model's answer."""
+    step_weight: float = 0.0
+    """Weight of step advantages in GRPO."""
+    step_discount: float = 1.0
 
     @staticmethod
     def of(settings: EpisodesTable) -> EpisodeTerms | None:
@@ -37,6 +40,8 @@ class EpisodeTerms:
             settings.call_cost,
             settings.failure_cost,
             settings.answer_tokens,
+            settings.step_weight,
+            settings.step_discount,
         )
 
     @property

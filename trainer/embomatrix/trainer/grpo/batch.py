@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredGroup:
-    """Plans of one task as rows, with their advantages. Tensors have shape (G, tokens), ``advantages`` has (G,).
+    """Plans of one task as rows, with their advantages. Tensors have shape (G, tokens), ``advantages`` may have (G, 1).
 
     ``mask`` is true on tokens in the loss: not on those of lost plans, nor of plans that ``Overlong.MASK`` leaves out.
     ``longest`` counts the tokens up to the end of the longest plan, ``counted`` those of the group in the denominator of the
@@ -68,8 +68,13 @@ def scored_groups(
     known = ~torch.isnan(rewards)  # (tasks, G)
     advantages = group_advantages(rewards, settings.spread_floor)
     mask = chunk.mask & known.view(-1, 1).to(chunk.mask.device)  # (plans, tokens)
+    token_advantages = [
+        _token_advantages(chunk, number, rewards, advantages.values, settings.spread_floor)
+        for number in range(len(chunk.tasks))
+    ]  # of each task: (G, tokens or 1)
     has_plan = mask.any(dim=1).view(shape).any(dim=1).cpu()  # (tasks,)
-    learns = has_plan if settings.keeps_zero_variance_groups else has_plan & ~advantages.zero_variance
+    has_signal = torch.tensor([bool(values.any()) for values in token_advantages])  # (tasks,)
+    learns = has_plan if settings.keeps_zero_variance_groups else has_plan & has_signal
     zero_variance, cut_off, longest, counted = (
         column.tolist()
         for column in (
@@ -83,8 +88,8 @@ def scored_groups(
     found = []
     for number, (task, prompt) in enumerate(zip(chunk.tasks, chunk.prompts, strict=True)):
         rows = slice(number * group, (number + 1) * group)
-        values = advantages.values[number]  # (G,)
-        log = GroupLog(task, outcomes[number], tuple(values.tolist()), zero_variance[number], cut_off[number])
+        values = tuple(advantages.values[number].tolist())
+        log = GroupLog(task, outcomes[number], values, zero_variance[number], cut_off[number])
         found.append(
             ScoredGroup(
                 log=log,
@@ -94,13 +99,24 @@ def scored_groups(
                 old_logprobs=old[rows],
                 sampler_logprobs=samples.logprobs[rows],
                 reference=None if chunk.reference is None else chunk.reference[rows],
-                advantages=values.to(samples.tokens.device),
+                advantages=token_advantages[number],
                 longest=longest[number],
                 counted=counted[number],
                 learns=bool(learns[number]),
             )
         )
     return found
+
+
+def _token_advantages(
+    chunk: SampledChunk, number: int, rewards: Tensor, advantages: Tensor, floor: float
+) -> Tensor:
+    """Return the advantages of a task's tokens, (G, tokens), or of its plans, (G, 1). ``rewards``: (tasks, G)."""
+    own = advantages[number].to(chunk.mask.device)  # (G,)
+    if chunk.states is None:
+        return own[:, None]
+    rows = slice(number * len(own), (number + 1) * len(own))
+    return chunk.states.of(rows).token_advantages(rewards[number], own, chunk.mask[rows], floor)
 
 
 def minibatches_of(groups: Sequence[T], count: int, rng: np.random.Generator) -> list[list[T]]:
@@ -149,7 +165,7 @@ def microbatch_of(groups: Sequence[ScoredGroup], totals: LossTotals) -> Microbat
         old_logprobs=rows(lambda each: each.old_logprobs),
         sampler_logprobs=rows(lambda each: each.sampler_logprobs),
         reference=_reference_of(groups, length),
-        advantages=torch.cat([each.advantages for each in groups]),
+        advantages=_joined_advantages([each.advantages for each in groups], length),
         totals=totals,
     )
 
@@ -157,6 +173,12 @@ def microbatch_of(groups: Sequence[ScoredGroup], totals: LossTotals) -> Microbat
 def _reference_of(groups: Sequence[ScoredGroup], length: int) -> Tensor | None:
     found = [_with_length(each.reference, length) for each in groups if each.reference is not None]
     return torch.cat(found) if found else None
+
+
+def _joined_advantages(groups: Sequence[Tensor], length: int) -> Tensor:
+    """Join advantages of groups: (plans, 1), or (plans, tokens) if those of tokens differ."""
+    by_token = any(each.shape[1] > 1 for each in groups)
+    return torch.cat([_with_length(each, length) if by_token else each for each in groups])
 
 
 def _with_length(rows: Tensor, length: int) -> Tensor:

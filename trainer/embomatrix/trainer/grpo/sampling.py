@@ -18,6 +18,7 @@ from embomatrix.trainer.config.settings import GrpoSettings, Overlong
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.episodes.batches import EpisodeBatch, PlayedBatch, play_batches
 from embomatrix.trainer.episodes.client import EpisodeClient, PlannedEpisode
+from embomatrix.trainer.grpo.step_advantages import AnswerStates, StepRule
 from embomatrix.trainer.learning.learner import SamplingRule
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
@@ -50,6 +51,8 @@ class SampledChunk:
     futures: Sequence[Future[tuple[PlanOutcome, ...]]]
     reference: Tensor | None = None
     old_logprobs: Tensor | None = None
+    states: AnswerStates | None = None
+    """In episodes with step advantages: the states in which the policy answered."""
     waited_s: float = 0.0
     """Seconds of sampling in which the trainer's own process waited for the cluster: in episodes."""
 
@@ -197,6 +200,7 @@ class EpisodeSampler(Sampler):
         self._policy = policy
         self._terms = terms
         self._client = EpisodeClient(gateway, terms, policy.codec)
+        self._step_rule = StepRule(terms.step_weight, terms.step_discount) if terms.step_weight else None
 
     def _chunks(
         self, step: int, parts: Sequence[_Part], rng: np.random.Generator, seed_of: Callable[[str], int]
@@ -211,10 +215,13 @@ class EpisodeSampler(Sampler):
         ]
         rule = replace(SamplingRule.of(self._settings), max_new=self._terms.answer_tokens)
         played = play_batches(batches, self._workers, self._client, self._policy, rule)
-        return [_chunk_of(each, here=self._workers.remote(each.batch.index) is None) for each in played]
+        here = [self._workers.remote(each.batch.index) is None for each in played]
+        return [
+            _chunk_of(each, self._step_rule, here=is_here) for each, is_here in zip(played, here, strict=True)
+        ]
 
 
-def _chunk_of(played: PlayedBatch, *, here: bool) -> SampledChunk:
+def _chunk_of(played: PlayedBatch, step_rule: StepRule | None, *, here: bool) -> SampledChunk:
     tasks = [planned.task for planned in played.batch.planned]
     futures = []
     for outcomes in played.outcomes():
@@ -228,6 +235,9 @@ def _chunk_of(played: PlayedBatch, *, here: bool) -> SampledChunk:
         played.samples,
         played.samples.mask,
         futures,
+        states=None
+        if step_rule is None
+        else AnswerStates(step_rule, [each.states for each in played.episodes]),
         waited_s=played.waited_s if here else 0.0,
     )
 

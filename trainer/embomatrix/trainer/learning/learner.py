@@ -22,7 +22,7 @@ class Microbatch:
     """Part of a step that is back-propagated at once: ``prompts``, and one group of plans per prompt as rows.
 
     ``tokens``, ``mask``, ``old_logprobs``, ``sampler_logprobs`` and ``reference`` have shape (plans, tokens);
-    ``advantages`` has (plans,). ``totals`` holds the denominators of the loss.
+    ``advantages`` may have (plans, 1). ``totals`` holds the denominators of the loss.
     """
 
     prompts: Sequence[Tokens]

@@ -65,7 +65,7 @@ def group_advantages(rewards: Tensor, eps: float = 1e-4) -> Advantages:
 
 @dataclass(frozen=True, slots=True)
 class LossInputs:
-    """One microbatch with plans as rows. All shapes are (plans, tokens), except ``advantages``: (plans,).
+    """One microbatch with plans as rows. All shapes are (plans, tokens); ``advantages`` may have (plans, 1).
 
     ``mask`` is true on a plan's tokens, including the end token, and false on all of a lost plan. ``reference`` and
     ``entropy`` may be None if their coefficients are 0. With coefficient 0, ``entropy`` is only logged and needs no gradient.
@@ -105,7 +105,7 @@ def surrogate_loss(
     mask = inputs.mask.to(inputs.logprobs.dtype)  # (plans, tokens)
     level = settings.ratio_level
     importance_ratio = _ratio(inputs.logprobs, inputs.old_logprobs, mask, level)  # (plans, tokens or 1)
-    advantages = inputs.advantages[:, None]  # (plans, 1)
+    advantages = inputs.advantages  # (plans, tokens or 1)
     clipped = importance_ratio.clamp(1 - settings.clip_low, 1 + settings.clip_high)
     gain = torch.minimum(importance_ratio * advantages, clipped * advantages)  # (plans, tokens or 1)
     if settings.truncate_ratio is not None and inputs.sampler_logprobs is not None:
@@ -139,6 +139,8 @@ def kl_estimate(logprobs: Tensor, reference: Tensor) -> Tensor:
 def _average_gain(gain: Tensor, mask: Tensor, settings: GrpoSettings, totals: LossTotals) -> Tensor:
     """A ratio per plan gives one term per plan in the paper's loss; in all others it applies to each token."""
     if settings.loss is LossKind.PAPER and settings.ratio_level is not RatioLevel.TOKEN:
+        if gain.shape[1] > 1:  # advantages of tokens: the plan's is their mean
+            gain = (gain * mask).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp(min=1)
         present = mask.amax(dim=1)  # (plans,): 0 for a lost rollout
         return (gain[:, 0] * present).sum() / max(totals.plans, 1)
     return _average(gain.expand_as(mask), mask, settings.loss, totals)
@@ -162,7 +164,7 @@ def loss_divisor(kind: LossKind, totals: LossTotals) -> int:
 def _metrics(
     inputs: LossInputs, mask: Tensor, importance_ratio: Tensor, settings: GrpoSettings
 ) -> LossMetrics:
-    advantages = inputs.advantages[:, None]  # (plans, 1)
+    advantages = inputs.advantages  # (plans, tokens or 1)
     low = (importance_ratio < 1 - settings.clip_low) & (advantages < 0)
     high = (importance_ratio > 1 + settings.clip_high) & (advantages > 0)
     tokens = mask.sum().clamp(min=1)
