@@ -547,8 +547,11 @@ while (!hasLeft()) {
     if (error.code === status.ABORTED) {
       registration = null;
       // A new manager adopts the leases that this worker claims. Otherwise they belong to other workers.
-      if (detail("embomatrix-error") !== "unknown-session") {
+      const reason = detail("embomatrix-error");
+      if (reason !== "unknown-session") {
         [...held.keys(), ...outbox.keys()].forEach(forget);
+      }
+      if (reason === undefined) {
         conflictsMs.push(Date.now());
         if (conflictsMs.at(-1) - conflictsMs.at(-1 - CONFLICTS.most) < CONFLICTS.withinMs) {
           throw new Error(`another worker named ${name} takes the session over again and again: stop it`, { cause: error });

@@ -10,7 +10,13 @@ from tests.fakes.leases import lease_to_proto
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import SERVER_OPTIONS, chunks_of
-from embomatrix.rpc.status import NotFoundError, SupersededError, translate
+from embomatrix.rpc.status import (
+    NotFoundError,
+    SessionLostError,
+    SupersededError,
+    UnavailableError,
+    translate,
+)
 from embomatrix.rpc.wire.bounds import parsed
 from embomatrix.rpc.wire.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.session import (
@@ -45,6 +51,12 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
     steps: dict = field(default_factory=dict)
     fetches: list[str] = field(default_factory=list)
     epoch: int = 0
+    back_s: float = 0.0
+    ended: SupersededError = field(
+        default_factory=lambda: SupersededError("this session is not known: register again")
+    )
+    breaking: bool = False
+    """The next fetch breaks the connection in its middle, for a second."""
     outgoing: asyncio.Queue = field(default_factory=asyncio.Queue)
 
     def bundle(self, content):
@@ -78,16 +90,25 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
     def resume(self):
         self.outgoing.put_nowait(pb.SessionResponse(resume=True))
 
-    def break_stream(self):
+    def break_stream(self, away_s=0.0):
+        """End the session, and accept no other for some seconds."""
+        self.back_s = asyncio.get_running_loop().time() + away_s
         self.outgoing.put_nowait(None)
 
     def forget_session(self):
         self.epoch += 1
         self.outgoing.put_nowait(None)
 
+    def lose_session(self):
+        """Forget the session because of its worker's silence."""
+        self.ended = SessionLostError("worker w is lost (its connection broke): register again")
+        self.forget_session()
+
     def _check(self, message):
+        if asyncio.get_running_loop().time() < self.back_s:
+            raise UnavailableError("the manager is away")
         if message.session_epoch != self.epoch:
-            raise SupersededError("this session is not known: register again")
+            raise self.ended
 
     async def Register(self, request, context):
         async with translate(context):
@@ -159,6 +180,10 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
                 data = b"damaged" + data
             for chunk in chunks_of(data):
                 yield pb.FetchBundleResponse(chunk=chunk)
+                if self.breaking:
+                    self.breaking = False
+                    self.break_stream(away_s=1.0)
+                    await asyncio.sleep(60)
 
 
 @contextlib.asynccontextmanager

@@ -79,6 +79,10 @@ class UnknownSessionError(SupersededError):
     """Session of a former manager: register again and report all leases, which this manager may adopt."""
 
 
+class SessionLostError(SupersededError):
+    """Session whose worker fell silent or whose connection broke for too long: its leases are re-dispatched, register again."""
+
+
 class TrimmedError(ClusterError):
     """Results that are no longer kept at this cursor."""
 
@@ -107,7 +111,10 @@ STATUS: Final[Mapping[type[ClusterError], grpc.StatusCode]] = {
 }
 _ERRORS: Final = {code: error for error, code in STATUS.items()}
 _PLAIN: Final = "1"
-_NAMED: Final[Mapping[str, type[ClusterError]]] = {"unknown-session": UnknownSessionError}
+_NAMED: Final[Mapping[str, type[ClusterError]]] = {
+    "unknown-session": UnknownSessionError,
+    "session-lost": SessionLostError,
+}
 """Errors that share a status with others, by the value of ``ERROR_KEY`` that identifies them."""
 _NAMES: Final = {error: name for name, error in _NAMED.items()}
 

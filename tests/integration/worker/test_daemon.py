@@ -218,6 +218,30 @@ async def test_repeated_session_conflicts_end_the_daemon(tmp_path):
             await asyncio.wait_for(task, 10)
 
 
+async def test_lost_sessions_do_not_look_like_another_worker_of_the_name(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path) as (_, task):
+        for count in range(1, 8):
+            await _until(lambda count=count: len(manager.registrations) >= count or task.done())
+            manager.lose_session()
+        await _until(lambda: len(manager.registrations) >= 8 or task.done())
+        assert not task.done()
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+    assert _done(manager) == ["l1"]
+
+
+async def test_bundle_is_fetched_over_the_next_connection_if_one_breaks(tmp_path):
+    manager = FakeManager(breaking=True)
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path):
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+    assert isinstance(manager.results[0].outcome, Completed)
+    assert manager.fetches == [digest, digest]
+
+
 async def test_cancelled_lease_gives_no_result(tmp_path):
     manager = FakeManager()
     digest = manager.bundle(b"ok")

@@ -9,7 +9,7 @@ from embomatrix.manager.control.events import (
     WorkerLost,
 )
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry, WorkerStanding
-from embomatrix.rpc.status import NotFoundError, SupersededError
+from embomatrix.rpc.status import NotFoundError, SessionLostError, SupersededError, UnknownSessionError
 from embomatrix.rpc.wire.values import Resources
 
 RESOURCES = Resources(2, 2, 1024)
@@ -47,6 +47,23 @@ def test_same_process_keeps_its_leases_under_a_new_session(registry):
     with pytest.raises(SupersededError):
         registry.find(old.session_id, old.epoch)
     assert registry.find(new.session_id, new.epoch) is new
+
+
+def test_lost_worker_is_told_that_it_was_lost_and_not_replaced(registry):
+    session, _ = join(registry)
+    registry.end(session, "its connection broke")
+    with pytest.raises(SessionLostError, match="its connection broke"):
+        registry.find(session.session_id, session.epoch)
+    with pytest.raises(SessionLostError, match="its connection broke"):
+        registry.find_by_id(session.session_id)
+
+
+def test_superseded_session_is_never_one_of_a_former_manager(registry):
+    old, _ = join(registry)
+    join(registry, boot_id="boot-2")
+    with pytest.raises(SupersededError, match="was superseded") as error:
+        registry.find_by_id(old.session_id)
+    assert not isinstance(error.value, UnknownSessionError)
 
 
 def test_session_with_a_wrong_epoch_is_refused(registry):

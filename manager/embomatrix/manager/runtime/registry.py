@@ -10,7 +10,13 @@ from enum import StrEnum
 from typing import Final
 
 from embomatrix.manager.control.events import DrainChanged, Event, SuspicionChanged, WorkerJoined, WorkerLost
-from embomatrix.rpc.status import NotFoundError, OverloadedError, SupersededError, UnknownSessionError
+from embomatrix.rpc.status import (
+    NotFoundError,
+    OverloadedError,
+    SessionLostError,
+    SupersededError,
+    UnknownSessionError,
+)
 from embomatrix.rpc.wire.values import Resources
 
 LISTED: Final = 10
@@ -165,8 +171,8 @@ class Registry:
     def find(self, session_id: str, epoch: int) -> WorkerSession:
         """Return the live session. Raises SupersededError for an ended one, whose worker must stop.
 
-        Raises UnknownSessionError for a session of a former manager, whose worker keeps its leases and registers
-        again.
+        Raises SessionLostError if its worker was lost, and UnknownSessionError for a session of a former manager, whose worker
+        keeps its leases and registers again.
         """
         if epoch < self._first_epoch:
             raise UnknownSessionError(
@@ -179,13 +185,15 @@ class Registry:
                 "this session is not known or was superseded by a newer one: register again"
             )
         if session.standing.is_gone:
-            raise SupersededError(f"worker {worker_id} is lost ({session.reason}): register again")
+            raise SessionLostError(f"worker {worker_id} is lost ({session.reason}): register again")
         return session
 
     def find_by_id(self, session_id: str) -> WorkerSession:
-        """Return the live session, for calls without an epoch."""
+        """Return the live session, for calls without an epoch. Raises SupersededError for any other."""
         session = self._sessions.get(self._worker_of.get(session_id, ""))
-        return self.find(session_id, session.epoch if session is not None else 0)
+        if session is None:
+            raise SupersededError("this session is not known here or was superseded: register again")
+        return self.find(session_id, session.epoch)
 
     def end(
         self, session: WorkerSession, reason: str, standing: WorkerStanding = WorkerStanding.LOST

@@ -97,7 +97,8 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
 
     async def Heartbeat(self, request: pb.HeartbeatRequest, context: Context) -> pb.HeartbeatResponse:
-        self._check_session(context, self._runtime.registry.find_by_id(request.session_id))
+        session = self._runtime.registry.find(request.session_id, request.session_epoch)
+        self._check_session(context, session)
         interval_s = self._runtime.process_heartbeat(
             request.session_id,
             request.session_epoch,

@@ -24,6 +24,7 @@ from embomatrix.rpc.status import (
     DeadlineError,
     InternalError,
     OverloadedError,
+    SessionLostError,
     SupersededError,
     UnavailableError,
     UnknownSessionError,
@@ -38,7 +39,7 @@ from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.cache import BundleCache
 from embomatrix.worker.link.membership import Membership, MembershipFile
 from embomatrix.worker.link.outbox import ResultOutbox
-from embomatrix.worker.link.session import ManagerSession, Registration, register
+from embomatrix.worker.link.session import FETCH_S, ManagerSession, Registration, register
 from embomatrix.worker.link.status import StatusFile, WorkerStatus, daemon_pids
 from embomatrix.worker.slots.pool import SlotPool
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM
@@ -226,6 +227,10 @@ class Daemon:
                 self._registration = None
                 self._backoff.reset()
                 await self._wait_before_next(error)
+            except SessionLostError as error:
+                self._give_up_leases(str(error))
+                self._registration = None
+                logger.info("registering again: %s", error)
             except SupersededError as error:
                 self._give_up_leases(str(error))
                 self._note_conflict(error)
@@ -389,18 +394,28 @@ def sendable(result: LeaseResult) -> LeaseResult:
 
 
 async def fetch(session_now: Callable[[], ManagerSession | None], digest: str) -> bytes:
-    """Fetch a bundle over the current session, and once more over the next if it breaks. Raise LoadError."""
-    for last in (False, True):
-        session = session_now()
-        if session is None:
-            break
-        try:
-            return await session.fetch(digest)
-        except (ClusterError, TimeoutError) as error:
-            if last:
-                raise LoadError(InfraCode.SCENE_LOAD_FAILED, f"not fetched: {error}") from error
-            await asyncio.sleep(FETCH_AGAIN_S)
-    raise LoadError(InfraCode.SCENE_LOAD_FAILED, "there is no connection to the manager")
+    """Fetch a bundle over the current session, and once more, over the next one if it breaks. Raise LoadError."""
+    try:
+        return await (await _live(session_now)).fetch(digest)
+    except (ClusterError, TimeoutError):
+        await asyncio.sleep(FETCH_AGAIN_S)
+    try:
+        return await (await _live(session_now)).fetch(digest)
+    except (ClusterError, TimeoutError) as error:
+        raise LoadError(InfraCode.SCENE_LOAD_FAILED, f"not fetched: {error}") from error
+
+
+async def _live(session_now: Callable[[], ManagerSession | None]) -> ManagerSession:
+    """Wait for a session that is not over: a manager that starts again takes seconds. Raise LoadError."""
+    waited_s = 0.0
+    while (session := session_now()) is None or session.is_over:
+        if waited_s >= FETCH_S:
+            raise LoadError(
+                InfraCode.SCENE_LOAD_FAILED, f"there was no connection to the manager for {FETCH_S:g} s"
+            )
+        await asyncio.sleep(FETCH_AGAIN_S)
+        waited_s += FETCH_AGAIN_S
+    return session
 
 
 async def serve(daemon: Daemon, signals: tuple[int, ...]) -> None:

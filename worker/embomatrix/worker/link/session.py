@@ -43,6 +43,7 @@ logger = logging.getLogger(__name__)
 REGISTER_S: Final = 10.0
 HEARTBEAT_S: Final = 2.0
 FETCH_S: Final = 30.0
+BROKEN: Final = "the connection to the manager broke"
 """Limits for the answers to a registration, a heartbeat and a request for a bundle."""
 HEARTBEATS_MISSED: Final = 3
 """Consecutive unanswered heartbeats after which the connection counts as dead."""
@@ -129,6 +130,8 @@ class ManagerSession:
         self._data_channel: grpc.aio.Channel | None = None
         self.attached = asyncio.Event()
         """Set after the first message of the manager."""
+        self.is_over = False
+        """True once ``serve`` has ended: this session fetches nothing any more."""
         self.renewed_s = renewed_s
         """Time of the last renewal of the leases, in this session or an earlier one."""
 
@@ -187,7 +190,7 @@ class ManagerSession:
                 for task in done:
                     task.result()
             finally:
-                self._data_channel = None
+                self.is_over, self._data_channel = True, None
                 self._stop_lingering()
                 for task in (heartbeats, stream):
                     task.cancel()
@@ -208,11 +211,11 @@ class ManagerSession:
         return open_channel(self._address, self._membership.token, self._membership.ca)
 
     async def fetch(self, digest: str) -> bytes:
-        """Fetch a bundle's bytes from the manager. Raise LoadError."""
+        """Fetch a bundle's bytes from the manager. Raise LoadError, or ClusterError or TimeoutError if the connection broke."""
         async with asyncio.timeout(FETCH_S):
             await self.attached.wait()
         if self._data_channel is None:
-            raise LoadError(InfraCode.SCENE_LOAD_FAILED, "the connection to the manager broke")
+            raise UnavailableError(BROKEN)
         stub = worker_service_pb2_grpc.WorkerServiceStub(self._data_channel)
         request = pb.FetchBundleRequest(session_id=self._registration.session_id, bundle_digest=digest)
         data = bytearray()
@@ -225,6 +228,12 @@ class ManagerSession:
                         raise LoadError(InfraCode.BUNDLE_CORRUPT, text)
         except NotFoundError as error:
             raise LoadError(InfraCode.SCENE_LOAD_FAILED, str(error)) from error
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if task is None or task.cancelling():
+                raise
+            # gRPC cancels the calls of a channel that is closed, not the task that waits for them.
+            raise UnavailableError(BROKEN) from None
         return bytes(data)
 
     async def _stream(self, channel: grpc.aio.Channel) -> None:
