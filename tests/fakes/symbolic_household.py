@@ -288,6 +288,7 @@ class SymbolicCluster:
     announced: list[tuple[int, list[int]]] = field(default_factory=list)
     batches: list[str] = field(default_factory=list)
     sent: set[str] = field(default_factory=set)
+    seeds: list[tuple[str, int]] = field(default_factory=list)
     executed: int = 0
     reports: list[TrainingReport] = field(default_factory=list)
     closed: bool = False
@@ -320,6 +321,7 @@ class SymbolicCluster:
         groups = set()
         for cursor, rollout in enumerate(batch.rollouts, start=1):
             assert rollout.bundle_digest in self.sent
+            self.seeds.append((rollout.task_id, rollout.seed))
             first = rollout.group_id not in groups
             groups.add(rollout.group_id)
             yield RolloutResult(

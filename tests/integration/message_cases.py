@@ -713,8 +713,8 @@ COMMANDS = (
     CommandCase(
         "truncated importance sampling on fresh plans",
         "train --settings=FILES/truncate.toml --dataset=KITCHEN --out=FILES/new",
-        "expected grpo.overlap = 'ahead'",
-        "leave it out, or change grpo.overlap",
+        "expected none (found 2), because the policy that learns samples the plans itself",
+        "leave it out, or set grpo.overlap = 'ahead' or sampler.url",
     ),
     CommandCase(
         "model server without http://",

@@ -62,7 +62,9 @@ def demo(
     ] = None,
     model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
     seed: Annotated[int, typer.Option(help="Random seed of policy and sampling.")] = 0,
-    threads: Annotated[int, typer.Option(min=0, help="torch threads per process. 0: half of the cores.")] = 0,
+    threads: Annotated[
+        int, typer.Option(min=0, help="torch threads per process. 0: half of the cores in all.")
+    ] = 0,
 ) -> None:
     """Start a local cluster and train on real tasks, from nothing to a report."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[RichHandler(show_path=False)])

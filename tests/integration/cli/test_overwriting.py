@@ -68,7 +68,7 @@ REFUSALS = (
     Refusal("scene import house.json --out OUT/flat.toml", "OUT/flat.toml"),
     Refusal("scene draw --as relations --out OUT", "OUT/relations.png"),
     Refusal("model import-gguf K OUT", "OUT/config.json"),
-    Refusal("model release K OUT", "OUT/notes.txt"),
+    Refusal("model release K OUT --command X", "OUT/notes.txt"),
     Refusal("train --dataset K --out OUT", "OUT/report.html"),
     Refusal("train --dataset K --out OUT", "OUT/metrics.jsonl"),
     Refusal("imitate --dataset K --out OUT", "OUT/reference/notes.txt"),

@@ -228,9 +228,14 @@ async def test_lost_plan_is_retried_for_a_number_and_then_raises():
 
 
 async def test_openrlhf_gets_tensors_and_lost_plans_are_retried():
-    ids = [FIRST.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
-    with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
-        rewards = await openrlhf.rewards_of(opened, ids, [oracle(FIRST), oracle(SECOND), "hm"])
+    asked = [
+        RewardLabel(task.task.task_id, task.bundle_digest, Profile.PAPER, seed)
+        for task, seed in ((FIRST, 7), (SECOND, 8), (FIRST, 7))
+    ]
+    cluster = SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))
+    with scorer(cluster) as opened:
+        rewards = await openrlhf.rewards_of(opened, asked, [oracle(FIRST), oracle(SECOND), "hm"])
+    assert set(cluster.seeds) == {(FIRST.task.task_id, 7), (SECOND.task.task_id, 8)}
     payload = openrlhf.reward_payload(rewards)
     assert payload["scores"].tolist() == [1.0, 1.0, 0.0]
     assert payload["rewards"].tolist() == pytest.approx([reward.total for reward in rewards])
@@ -239,7 +244,7 @@ async def test_openrlhf_gets_tensors_and_lost_plans_are_retried():
         scorer(SymbolicCluster(TASKS, lose_first=True)) as opened,
         pytest.raises(TrainerError, match="lost a plan of the task 'task-0' 3 times"),
     ):
-        await openrlhf.rewards_of(opened, ids[:1], [oracle(FIRST)])
+        await openrlhf.rewards_of(opened, asked[:1], [oracle(FIRST)])
 
 
 def test_openrlhf_errors_name_the_mismatched_query_and_the_missing_setting():

@@ -104,7 +104,9 @@ def test_default_threads_and_processes_depend_on_the_model(kitchen, tmp_path, mo
     monkeypatch.setattr(starting, "usable_cores", lambda: 8)
     shape = {name: value for name, value in SMALL.items() if name != "threads"}
     by_itself = start_run(kitchen, tmp_path / "itself", "tiny", None, shape).settings
-    assert (by_itself.threads, by_itself.processes) == (4, 2)
+    assert (by_itself.threads, by_itself.processes) == (2, 2)
+    alone = start_run(kitchen, tmp_path / "alone", "tiny", None, {**shape, "processes": 1}).settings
+    assert (alone.threads, alone.processes) == (4, 1)
     written = tmp_path / "settings.toml"
     written.write_text("threads = 1\nprocesses = 3\n")
     chosen = start_run(kitchen, tmp_path / "chosen", "tiny", written, {**shape, "threads": None}).settings

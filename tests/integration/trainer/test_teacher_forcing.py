@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import signal
 
 import pytest
@@ -63,6 +64,31 @@ def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
 
 def weights(policy):
     return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
+
+
+def test_gradients_that_are_not_finite_change_no_weight_and_end_imitation(tmp_path, monkeypatch):
+    settings = settings_of()
+    begun = weights(new_policy(settings, TASKS))
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda parameters, most: torch.tensor(math.nan))
+    steps, changed = [], []
+
+    def report(step):
+        steps.append(step.step)
+        changed.append(not torch.equal(weights(policy), begun))
+
+    policy = new_policy(settings, TASKS)
+    progress = TrainingProgress()
+    with (
+        DataParallelWorkers.start(policy, settings) as workers,
+        pytest.raises(
+            TrainerError, match=r"norm in step 5 is nan, .* unchanged: lower imitation\.learning_rate"
+        ),
+    ):
+        run_imitation(
+            RunStart(settings, TASKS, policy, progress), workers, tmp_path, Recorder(tmp_path), report
+        )
+    assert steps == [1, 2, 3, 4]
+    assert not any(changed)
 
 
 @pytest.mark.parametrize("stopping", [{}, STOPPING])

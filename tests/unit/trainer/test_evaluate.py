@@ -41,6 +41,16 @@ def test_paired_difference_is_significant_within_both_intervals():
     assert change.low > 0
 
 
+@pytest.mark.parametrize("tasks", [1, 2, 20, 200])
+def test_equal_differences_leave_room_for_tasks_that_were_not_seen(tasks):
+    change = improvement(scored([5] * tasks), scored([5] * tasks))
+    assert change.value == 0
+    assert change.high == -change.low == pytest.approx(1 - 0.025 ** (1 / tasks))
+    best = improvement(scored([0] * tasks), scored([10] * tasks))
+    assert (best.value, best.high) == (1, 1)
+    assert best.low == pytest.approx(1 - 2 * change.high)
+
+
 def test_only_common_tasks_are_paired():
     assert improvement(scored([0, 0]), scored([10, 10, 10])).value == 1.0
     assert math.isnan(improvement(scored([5]), scored([5], prefix="other")).value)

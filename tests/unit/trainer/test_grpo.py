@@ -222,6 +222,26 @@ def test_kl_term_pulls_towards_the_reference():
     assert metrics.kl_to_reference > 0
 
 
+@pytest.mark.parametrize("reward", [0.1, 0.7, 30.3, 31.2])
+@pytest.mark.parametrize("size", [3, 5, 7, 16])
+def test_equal_rewards_have_no_spread_however_their_mean_is_rounded(reward, size):
+    result = group_advantages(torch.full((1, size), reward))
+    assert result.zero_variance.all()
+    assert not result.values.any()
+
+
+def test_metrics_tell_the_direction_of_each_divergence():
+    part = inputs()
+    metrics = surrogate_loss(part, settings_of(kl_coef=0.1), TOTALS)[1]
+    own = torch.tensor(MASK)
+    new, old = torch.tensor(NEW, dtype=torch.float64)[own], torch.tensor(OLD, dtype=torch.float64)[own]
+    reference = torch.tensor(REFERENCE, dtype=torch.float64)[own]
+    assert metrics.kl_to_old == pytest.approx(float(((new - old).exp() - (new - old) - 1).mean()))
+    away = reference - new
+    assert metrics.kl_to_reference == pytest.approx(float((away.exp() - away - 1).mean()))
+    assert surrogate_loss(inputs(reference=None), settings_of(), TOTALS)[1].kl_to_reference is None
+
+
 def test_advantages_are_centred_and_scaled_by_the_group():
     values = group_advantages(torch.tensor([[0.0, 1.0, 2.0, 3.0]]), eps=0.0).values[0]
     sigma = math.sqrt(5 / 3)

@@ -7,12 +7,14 @@ from types import SimpleNamespace
 import pytest
 from tests.fakes.symbolic_household import make_tasks
 
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.status import UnavailableError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
+from embomatrix.skills.prompt import Prompt
 from embomatrix.trainer.cluster.gateway import PlanOutcome
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.episodes.client import PlannedEpisode
-from embomatrix.trainer.episodes.oracle import oracle_episodes
+from embomatrix.trainer.episodes.oracle import oracle_episodes, successful
 
 TASKS = make_tasks(3, 1)
 
@@ -25,6 +27,20 @@ class LostEpisode:
 
     def outcome(self):
         return PlanOutcome("", None, self.lost)
+
+
+class SolvedEpisode:
+    opening = Prompt("", "Open the fridge.")
+    answers = ("open 2", "done")
+    told = ("open 2: opened fridge 2", "")
+
+    def outcome(self):
+        return PlanOutcome("", RewardBreakdown(1.0, 0.2, 30.0, (), success=True), None)
+
+
+def test_success_of_the_policy_alone_teaches_nothing():
+    assert successful(SolvedEpisode(), begun=1).begun == 1
+    assert successful(SolvedEpisode(), begun=2) is None
 
 
 class Client:

@@ -50,22 +50,24 @@ async def give_bundles(dataset: str | Path, client: ClusterClient) -> int:
 
 
 def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence[str]) -> dict[str, Any]:
-    """OpenRLHF's hook. Dataset and cluster come from the environment. Raises TrainerError."""
+    """OpenRLHF's hook. Dataset and cluster come from the environment, tasks and seeds from the labels. Raises TrainerError."""
     try:
         answers = [answer_in(query, prompt) for query, prompt in zip(queries, prompts, strict=True)]
-        task_ids = [RewardLabel.parse(label).task_id for label in labels]
+        asked = [RewardLabel.parse(label) for label in labels]
     except InvalidRequestError as error:
         raise TrainerError(str(error)) from error
     scorer = shared_scorer(dataset_named("", ""))
-    return reward_payload(asyncio.run(rewards_of(scorer, task_ids, answers)))
+    return reward_payload(asyncio.run(rewards_of(scorer, asked, answers)))
 
 
 async def rewards_of(
-    scorer: PlanScorer, task_ids: Sequence[str], answers: Sequence[str]
+    scorer: PlanScorer, labels: Sequence[RewardLabel], answers: Sequence[str]
 ) -> list[RewardBreakdown]:
-    """Return the reward of each answer. Lost rollouts are repeated."""
-    pairs = zip(task_ids, answers, strict=True)
-    return await asyncio.gather(*(scorer.reward_of(task_id, answer) for task_id, answer in pairs))
+    """Return the reward of each answer to the task of its label, under the label's seed. Lost rollouts are repeated."""
+    pairs = zip(labels, answers, strict=True)
+    return await asyncio.gather(
+        *(scorer.reward_of(label.task_id, answer, label.seed) for label, answer in pairs)
+    )
 
 
 def reward_payload(rewards: Sequence[RewardBreakdown]) -> dict[str, Any]:

@@ -76,7 +76,7 @@ class PlanScorer:
         self._lock = threading.Lock()
         self._opened: OpenRun | None = None
         self._numbers = itertools.count()
-        self._pending: dict[str, _PendingGroup] = {}
+        self._pending: dict[tuple[str, int], _PendingGroup] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ("_load", "_open_cluster", "_seed", "_terms")}
@@ -122,11 +122,12 @@ class PlanScorer:
             opened.gateway.__exit__()
 
     def submit(
-        self, task_ids: Sequence[str], texts: Sequence[str]
+        self, task_ids: Sequence[str], texts: Sequence[str], seed: int | None = None
     ) -> list[tuple[list[int], Future[tuple[PlanOutcome, ...]]]]:
         """Start the rollouts of these texts as one batch with a group for each task. Raises TrainerError for an unknown task.
 
-        Return the indices of each group's texts, and the future of their outcomes.
+        Return the indices of each group's texts, and the future of their outcomes. ``seed`` is that of the rollouts, by default
+        each task's.
         """
         opened = self.open()
         members: dict[str, list[int]] = {}
@@ -138,7 +139,7 @@ class PlanScorer:
                 task,
                 task.situation,
                 [texts[index] for index in members[task_id]],
-                training_seed(self._seed, task_id),
+                self._seed_of(task_id, seed),
             )
             for task_id, task in tasks.items()
         ]
@@ -146,9 +147,11 @@ class PlanScorer:
         futures = opened.gateway.submit(f"score-{number}", number, groups, Codec.JSON)
         return list(zip(members.values(), futures, strict=True))
 
-    async def score(self, task_ids: Sequence[str], texts: Sequence[str]) -> list[PlanOutcome]:
+    async def score(
+        self, task_ids: Sequence[str], texts: Sequence[str], seed: int | None = None
+    ) -> list[PlanOutcome]:
         """Score texts and keep their order. Can be awaited on any event loop. Raises TrainerError."""
-        pending = await asyncio.to_thread(self.submit, task_ids, texts)
+        pending = await asyncio.to_thread(self.submit, task_ids, texts, seed)
         outcomes: dict[int, PlanOutcome] = {}
         for indices, future in pending:
             try:
@@ -158,36 +161,38 @@ class PlanScorer:
             outcomes |= zip(indices, found, strict=True)
         return [outcomes[index] for index in range(len(texts))]
 
-    async def score_one(self, task_id: str, text: str) -> PlanOutcome:
-        """Score one text, grouped with others of its task within ``GROUPING_S``. Use one event loop at a time."""
-        group = self._pending.get(task_id)
+    async def score_one(self, task_id: str, text: str, seed: int | None = None) -> PlanOutcome:
+        """Score one text, grouped with others of its task and seed within ``GROUPING_S``. Use one event loop at a time."""
+        key = task_id, self._seed_of(task_id, seed)
+        group = self._pending.get(key)
         if group is None:
-            group = self._pending[task_id] = _PendingGroup(
-                [], asyncio.create_task(self._score_pending(task_id))
-            )
+            group = self._pending[key] = _PendingGroup([], asyncio.create_task(self._score_pending(*key)))
         index = len(group.texts)
         group.texts.append(text)
         return (await asyncio.shield(group.work))[index]
 
-    async def reward_of(self, task_id: str, text: str) -> RewardBreakdown:
+    async def reward_of(self, task_id: str, text: str, seed: int | None = None) -> RewardBreakdown:
         """Return the reward of one text, for trainers that need a number. Texts of a task are grouped as in ``score_one``.
 
         A lost rollout is repeated; after ``ATTEMPTS``, a TrainerError is raised.
         """
         for _attempt in range(ATTEMPTS):
-            outcome = await self.score_one(task_id, text)
+            outcome = await self.score_one(task_id, text, seed)
             if outcome.reward is not None:
                 return outcome.reward
         raise TrainerError(
             f"the cluster lost a plan of the task {task_id!r} {ATTEMPTS} times: check its workers with `embomatrix status`"
         )
 
-    async def _score_pending(self, task_id: str) -> list[PlanOutcome]:
+    async def _score_pending(self, task_id: str, seed: int) -> list[PlanOutcome]:
         try:
             await asyncio.sleep(GROUPING_S)
         finally:
-            texts = self._pending.pop(task_id).texts
-        return await self.score([task_id] * len(texts), texts)
+            texts = self._pending.pop((task_id, seed)).texts
+        return await self.score([task_id] * len(texts), texts, seed)
+
+    def _seed_of(self, task_id: str, seed: int | None) -> int:
+        return training_seed(self._seed, task_id) if seed is None else seed
 
     def announce(self, steps: Sequence[Sequence[str]], group: int) -> None:
         """Announce the tasks of this step and the next ones to the cluster, with ``group`` plans each."""

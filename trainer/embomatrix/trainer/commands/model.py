@@ -47,9 +47,7 @@ def import_gguf_command(
 def release_command(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run, such as runs/demo.")],
     out: Annotated[Path, typer.Argument(help="New folder for the policy and its card.")],
-    command: Annotated[
-        str, typer.Option(help="Command that trained it, for the card.")
-    ] = "embomatrix demo --seed 0",
+    command: Annotated[str, typer.Option(help="Command that trained it, for the card.")],
 ) -> None:
     """Write the policy of a finished run without its state of training, with a card of what it was trained on and its success.
 

@@ -66,7 +66,9 @@ _REWARD = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME=VALUE", help="A reward coefficient (docs/rewards.md). Repeatable."),
 ]
-_THREADS = Annotated[int | None, typer.Option(min=1, help="torch threads. Default: half of the cores.")]
+_THREADS = Annotated[
+    int | None, typer.Option(min=1, help="torch threads per process. Default: half of the cores in all.")
+]
 _PROCESSES = Annotated[
     int | None,
     typer.Option(min=1, help="Data-parallel processes. Default: 2 for `tiny`, 1 for other models."),
@@ -379,10 +381,10 @@ def _show_summary(summary: TrainingSummary) -> None:
     outcome, stats = summary.outcome, summary.stats
     console.print(
         f"{outcome.imitation_steps} imitation steps, {outcome.steps} GRPO steps, {outcome.rollouts} rollouts, "
-        f"{outcome.lost} lost and masked, {stats.redispatched} re-dispatched; "
-        f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, prewarm hits {prewarm_share(stats)}, "
-        f"{stats.shared_share:.0%} of the steps shared; "
-        f"peak memory {outcome.peak_mb:,.0f} MB",
+        f"{outcome.lost} lost by the infrastructure, {stats.redispatched} re-dispatched; "
+        f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, announced scenes loaded before their first rollout: "
+        f"{prewarm_share(stats)}, steps reused from equal beginnings of other plans: {stats.shared_share:.0%}; "
+        f"peak memory of the main process {outcome.peak_mb:,.0f} MB",
         highlight=False,
     )
     console.print(f"report      {summary.report}\ncheckpoint  {summary.checkpoint}", highlight=False)

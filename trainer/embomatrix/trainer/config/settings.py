@@ -24,9 +24,9 @@ from embomatrix.trainer.config.errors import TrainerError
 
 
 class LossKind(StrEnum):
-    """Denominator of the loss."""
+    """Kind of loss: how the tokens' terms are averaged, and for GSPO the ratio too."""
 
-    PAPER = "paper"  # sum over a plan's tokens, mean over plans: the formula of the paper
+    PAPER = "paper"  # mean over plans of one term each with ratio = "sequence" (the paper), else of the sum over tokens
     GRPO = "grpo"  # mean over a plan's tokens, then over plans: DeepSeekMath
     BNPO = "bnpo"  # mean over the tokens of each microbatch, then over microbatches
     DAPO = "dapo"  # mean over all tokens of the step: a plan's weight grows with its length
@@ -99,7 +99,7 @@ class ZeroVariance(StrEnum):
 
 
 class Overlong(StrEnum):
-    """Treatment of a plan that ``grpo.max_new`` cut off before its end token."""
+    """Treatment of a plan that ``grpo.max_new`` cut off before its end token, or of an episode that the context cut off."""
 
     KEEP = "keep"  # learn from it as from any other plan
     MASK = "mask"  # leave its tokens out of the loss (DAPO's overlong filtering); its reward stays in the group's mean
@@ -526,9 +526,9 @@ def _without_server(settings: TrainSettings) -> TrainSettings:
     grpo = settings.grpo
     if grpo.truncate_ratio is not None and grpo.overlap is not Overlap.AHEAD:
         raise TrainerError(
-            f"setting 'grpo.truncate_ratio': expected grpo.overlap = 'ahead' or sampler.url with it, found "
-            f"{grpo.overlap.value!r} and no server, with which the policy that learns has sampled the plans: leave it out, or "
-            f"change grpo.overlap (found {grpo.truncate_ratio:g})"
+            f"setting 'grpo.truncate_ratio': expected none (found {grpo.truncate_ratio:g}), because the policy that learns "
+            f"samples the plans itself with grpo.overlap = {grpo.overlap.value!r}: leave it out, or set grpo.overlap = 'ahead' "
+            "or sampler.url"
         )
     return settings
 

@@ -207,8 +207,11 @@ async def finish(episode: ClusterEpisode, script: SearchingScript) -> None:
 
 
 def successful(episode: ClusterEpisode, begun: int = 0) -> OracleEpisode | None:
-    """Return an episode that is over as one to imitate, None if it failed or was lost. The policy began ``begun`` answers."""
-    if not episode.outcome().success or episode.opening is None:
+    """Return an episode that is over as one to imitate; None if it failed, was lost, or has no answer of the oracle.
+
+    The policy gave the first ``begun`` answers.
+    """
+    if not episode.outcome().success or episode.opening is None or len(episode.answers) == begun:
         return None
     return OracleEpisode(episode.opening, tuple(zip(episode.answers, episode.told, strict=True)), begun)
 

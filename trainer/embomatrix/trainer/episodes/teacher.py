@@ -44,8 +44,8 @@ _TOGETHER: Final = 16
 """Episodes that a learner samples together."""
 _EACH: Final = 2
 """Such batches that each learner plays at a time. With more, workers would load the scenes again and again."""
-_STREAM: Final = 4
-"""Part of the seed of a round's draws, which sets them apart from those of imitation."""
+_STREAM: Final = 6
+"""Part of the seed of a round's draws, which sets them apart from all others of a run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,9 +202,9 @@ class Teacher:
         return episode
 
     async def _finish_once(self, task: TrainingTask, episode: ClusterEpisode) -> None:
+        episode.begun = len(episode.answers)
         if episode.is_over:
             return
-        episode.begun = len(episode.answers)
         advice = await episode.advise()
         if advice is None or advice.problem:
             return

@@ -1,6 +1,7 @@
 """Causes of failure: rules that assign one cause to a failed plan from the plan and its trace alone.
 
-The first failure decides. `docs/evaluation.md` explains the rules; a test proves the tables complete.
+The first failure decides; in an episode, which goes on after a failure, the last call does. `docs/evaluation.md` explains the
+rules; a test proves the tables complete.
 """
 
 from collections.abc import Mapping, Sequence

@@ -21,9 +21,9 @@ class StepRecord:
     Rates are over rollouts with a result. Token means are over the plans that had a gradient, in all updates of the step,
     None if there were none. ``gradient_norm`` is the mean over the updates.
     ``reward_format``, ``reward_relevance`` and ``reward_goal`` are the means of the tiers and add up to ``reward``.
-    ``kl`` is to the reference policy, ``kl_to_old`` to the policy that sampled. ``sampler_gap`` and ``sampler_gap_max`` are
-    mean and maximum of the difference in nats between the log-probabilities of sampling and those of the policy at the
-    beginning of the step, 0 if the policy itself sampled.
+    ``kl`` is KL(policy || reference policy), None without a KL term; ``kl_to_old`` is KL(policy that sampled || policy).
+    ``sampler_gap`` and ``sampler_gap_max`` are mean and maximum of the difference in nats between the log-probabilities of
+    sampling and those of the policy at the beginning of the step, 0 if the policy itself sampled.
     """
 
     step: int
@@ -48,7 +48,7 @@ class StepRecord:
     rollouts: int
     lost: int
     cut_off: float
-    """Share of the rollouts that ``grpo.max_new`` cut off before their end token."""
+    """Share of the plans that ``grpo.max_new`` cut off before their end token, or of the episodes that the context cut off."""
     warm: float | None
     shared: float | None
     """Share of the steps that were known from equal plans or equal beginnings and not executed.
@@ -83,9 +83,10 @@ def record_of(
     weight = sum(part.weight for part in metrics)
 
     def over_tokens(name: str) -> float | None:
-        if not weight:
+        values = [(getattr(part, name), part.weight) for part in metrics]
+        if not weight or any(value is None for value, _ in values):
             return None
-        return float(sum(getattr(part, name) * part.weight for part in metrics) / weight)
+        return float(sum(value * tokens for value, tokens in values) / weight)
 
     return StepRecord(
         step=step,

@@ -178,9 +178,7 @@ class Sampler:
         ]
         futures = self._gateway.submit(f"step-{step}-{index}", step, plans, self._codec)
         tasks, task_prompts = zip(*prompts, strict=True)
-        mask = samples.mask
-        if self._settings.overlong is Overlong.MASK:
-            mask = mask & ~samples.cut_off[:, None]
+        mask = _mask_of(samples, self._settings)
         return SampledChunk(index, tasks, task_prompts, samples, mask, futures)
 
 
@@ -216,30 +214,32 @@ class EpisodeSampler(Sampler):
         rule = replace(SamplingRule.of(self._settings), max_new=self._terms.answer_tokens)
         played = play_batches(batches, self._workers, self._client, self._policy, rule)
         here = [self._workers.remote(each.batch.index) is None for each in played]
-        return [
-            _chunk_of(each, self._step_rule, here=is_here) for each, is_here in zip(played, here, strict=True)
-        ]
+        return [self._chunk_of(each, here=is_here) for each, is_here in zip(played, here, strict=True)]
+
+    def _chunk_of(self, played: PlayedBatch, *, here: bool) -> SampledChunk:
+        tasks = [planned.task for planned in played.batch.planned]
+        futures = []
+        for outcomes in played.outcomes():
+            future: Future[tuple[PlanOutcome, ...]] = Future()
+            future.set_result(outcomes)
+            futures.append(future)
+        return SampledChunk(
+            played.batch.index,
+            tasks,
+            [TaskPrompt(task.situation, tokens) for task, tokens in zip(tasks, played.prompts, strict=True)],
+            played.samples,
+            _mask_of(played.samples, self._settings),
+            futures,
+            states=AnswerStates(self._step_rule, [each.states for each in played.episodes])
+            if self._step_rule
+            else None,
+            waited_s=played.waited_s if here else 0.0,
+        )
 
 
-def _chunk_of(played: PlayedBatch, step_rule: StepRule | None, *, here: bool) -> SampledChunk:
-    tasks = [planned.task for planned in played.batch.planned]
-    futures = []
-    for outcomes in played.outcomes():
-        future: Future[tuple[PlanOutcome, ...]] = Future()
-        future.set_result(outcomes)
-        futures.append(future)
-    return SampledChunk(
-        played.batch.index,
-        tasks,
-        [TaskPrompt(task.situation, tokens) for task, tokens in zip(tasks, played.prompts, strict=True)],
-        played.samples,
-        played.samples.mask,
-        futures,
-        states=None
-        if step_rule is None
-        else AnswerStates(step_rule, [each.states for each in played.episodes]),
-        waited_s=played.waited_s if here else 0.0,
-    )
+def _mask_of(samples: Samples, settings: GrpoSettings) -> Tensor:
+    """Return the tokens in the loss: (plans, tokens)."""
+    return samples.mask & ~samples.cut_off[:, None] if settings.overlong is Overlong.MASK else samples.mask
 
 
 def _with_reference(chunk: SampledChunk, learner: Learner | RemoteLearner) -> SampledChunk:

@@ -13,7 +13,6 @@ Further passes over the batch, and all passes with several minibatches, begin wh
 from __future__ import annotations
 
 import functools
-import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -23,7 +22,6 @@ import numpy as np
 import torch
 
 from embomatrix.trainer.cluster.gateway import PlanOutcome, refuse_without_workers
-from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import GrpoSettings, LossKind, Overlap
 from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.grpo.batch import (
@@ -37,15 +35,12 @@ from embomatrix.trainer.grpo.batch import (
 from embomatrix.trainer.grpo.records import GroupLog, StepRecord, record_of
 from embomatrix.trainer.grpo.sampling import SampledChunk, Sampler
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
-from embomatrix.trainer.learning.gradient import Gradient, GradientSum
+from embomatrix.trainer.learning.gradient import FiniteGradients, Gradient, GradientSum
 from embomatrix.trainer.learning.learner import Learner
 from embomatrix.trainer.learning.objective import LossMetrics, LossTotals, loss_divisor
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.policy.protocol import Policy
-
-MAX_BAD_GRADIENTS = 5
-"""Consecutive updates with a non-finite gradient before the run ends: it has diverged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +86,10 @@ class Updater:
         self._gradient = GradientSum(policy, workers)
         self._sampler = sampler
         self._ahead: tuple[int, list[SampledChunk]] | None = None
-        self._bad_gradients = 0
+        self._finite = FiniteGradients(
+            "start a new run with a lower grpo.learning_rate, from this run's folder `reference` (--model) and with "
+            "--imitate-seconds=0"
+        )
         self.is_between_updates = False
         self.optimiser = torch.optim.AdamW(
             policy.parameters(), lr=settings.learning_rate, betas=(0.9, 0.95), weight_decay=0.0
@@ -279,18 +277,9 @@ class Updater:
             group["lr"] = self._settings.learning_rate * state.plan.rate_factor
         norm = float(torch.nn.utils.clip_grad_norm_(self._policy.parameters(), self._settings.max_grad_norm))
         state.norms.append(norm)
-        if math.isfinite(norm):
-            self._bad_gradients = 0
+        if self._finite.may_apply(norm, state.plan.step):
             self.is_between_updates = True
             self.optimiser.step()
-            return
-        self._bad_gradients += 1
-        if self._bad_gradients >= MAX_BAD_GRADIENTS:
-            raise TrainerError(
-                f"the gradient norm in step {state.plan.step} is {norm}, not finite for the {MAX_BAD_GRADIENTS}th update in a "
-                "row; these updates left the policy unchanged: start a new run with a lower grpo.learning_rate, from this "
-                "run's folder `reference` (--model) and with --imitate-seconds=0"
-            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import ImitationSettings
 from embomatrix.trainer.imitation.optimiser import ImitationOptimiser
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
-from embomatrix.trainer.learning.gradient import GradientSum
+from embomatrix.trainer.learning.gradient import FiniteGradients, GradientSum
 from embomatrix.trainer.learning.likelihood import negative_log_likelihood, plan_tokens
 from embomatrix.trainer.lifecycle.checkpoint import ImitationState
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
@@ -72,6 +72,9 @@ class Imitation:
         self._gradient = GradientSum(policy, workers)
         self._optimiser = ImitationOptimiser(policy.module, settings)
         self._best: dict[str, Tensor] = {}
+        self._finite = FiniteGradients(
+            "lower imitation.learning_rate, or imitation.matrix_learning_rate of the word-level policy, and start a new run"
+        )
 
     def tensors(self) -> dict[str, Any]:
         """State for a checkpoint, besides the policy and ``state``."""
@@ -140,9 +143,10 @@ class Imitation:
         chosen = rng.integers(len(self.training), size=settings.batch)
         examples = [self._source.example(self.training[int(at)], rng) for at in chosen]
         loss = self._gradient.imitate(examples, settings.chunk or len(examples))
-        torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
+        norm = float(torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0))
         interrupts.defer()
-        self._optimiser.step(_rate_factor(share, self.state.step, settings.warmup_steps))
+        if self._finite.may_apply(norm, self.state.step + 1):
+            self._optimiser.step(_rate_factor(share, self.state.step, settings.warmup_steps))
         return loss
 
     def _validate(self) -> float:

@@ -1,20 +1,45 @@
 """Gradient of an update, summed over microbatches that several processes back-propagate."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from torch import Tensor
 
+from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner
 from embomatrix.trainer.learning.learner import Learner, Microbatch
 from embomatrix.trainer.learning.likelihood import plan_tokens
 from embomatrix.trainer.learning.objective import LossMetrics
 from embomatrix.trainer.policy.protocol import ImitationExample, Policy
 
+MAX_BAD_GRADIENTS = 5
+"""Consecutive updates with a non-finite gradient before training ends: it has diverged."""
 T = TypeVar("T")
 Gradient = Sequence[Tensor | None]
 """Gradient by parameter. None: the parameter has none."""
+
+
+class FiniteGradients:
+    """Keeps gradients that are not finite from the weights. ``remedy`` ends the sentence of the error."""
+
+    def __init__(self, remedy: str) -> None:
+        self._remedy = remedy
+        self._bad = 0
+
+    def may_apply(self, norm: float, step: int) -> bool:
+        """Return whether a gradient of this norm may change the weights. Raises TrainerError after too many that may not."""
+        if math.isfinite(norm):
+            self._bad = 0
+            return True
+        self._bad += 1
+        if self._bad >= MAX_BAD_GRADIENTS:
+            raise TrainerError(
+                f"the gradient norm in step {step} is {norm}, not finite for the {MAX_BAD_GRADIENTS}th update in a row; these "
+                f"updates left the policy unchanged: {self._remedy}"
+            )
+        return False
 
 
 class GradientSum:

@@ -58,7 +58,10 @@ def group_advantages(rewards: Tensor, eps: float = 1e-4) -> Advantages:
     mean = torch.nanmean(rewards, dim=1, keepdim=True).nan_to_num()  # (tasks, 1)
     centred = torch.where(known, rewards - mean, torch.zeros_like(rewards))  # (tasks, samples)
     sigma = (centred.square().sum(dim=1, keepdim=True) / (count - 1).clamp(min=1)).sqrt()  # (tasks, 1)
-    zero_variance = (sigma[:, 0] < 1e-6) | (count[:, 0] < 2)  # (tasks,)
+    low = rewards.masked_fill(~known, torch.inf).amin(dim=1)  # (tasks,)
+    high = rewards.masked_fill(~known, -torch.inf).amax(dim=1)  # (tasks,)
+    # Not by sigma: rounding of the mean gives equal rewards a spread.
+    zero_variance = (high - low <= 1e-6) | (count[:, 0] < 2)  # (tasks,)
     values = centred / (sigma + eps)  # (tasks, samples)
     return Advantages(torch.where(zero_variance[:, None], torch.zeros_like(values), values), zero_variance)
 
@@ -86,11 +89,12 @@ class LossMetrics:
     """Means over the tokens of a microbatch, for the log. ``weight`` is the number of tokens.
 
     ``sampler_gap`` is the mean and ``sampler_gap_max`` the maximum of the absolute difference in nats between the
-    log-probabilities with which plans were sampled and those in the ratio's denominator.
+    log-probabilities with which plans were sampled and those in the ratio's denominator. ``kl_to_reference`` is
+    KL(policy || reference), None without a reference; ``kl_to_old`` is KL(sampling policy || policy).
     """
 
     clip_fraction: float
-    kl_to_reference: float
+    kl_to_reference: float | None
     kl_to_old: float
     entropy: float
     sampler_gap: float
@@ -131,7 +135,7 @@ def _ratio(logprobs: Tensor, old_logprobs: Tensor, mask: Tensor, level: RatioLev
 
 
 def kl_estimate(logprobs: Tensor, reference: Tensor) -> Tensor:
-    """Estimate KL(policy || reference) per sampled token: Schulman's k3, unbiased and never negative."""
+    """Estimate KL(policy || reference) per token that the policy sampled: Schulman's k3, unbiased and never negative."""
     gap = reference - logprobs
     return gap.exp() - gap - 1
 
@@ -177,8 +181,8 @@ def _metrics(
     gap = (inputs.old_logprobs - sampler).abs() * mask  # (plans, tokens)
     return LossMetrics(
         clip_fraction=mean((low | high).to(mask.dtype).expand_as(mask)),
-        kl_to_reference=0.0 if reference is None else mean(kl_estimate(inputs.logprobs, reference)),
-        kl_to_old=mean(kl_estimate(inputs.logprobs, sampler)),
+        kl_to_reference=None if reference is None else mean(kl_estimate(inputs.logprobs, reference)),
+        kl_to_old=mean(kl_estimate(sampler, inputs.logprobs)),
         entropy=0.0 if entropy is None else mean(entropy),
         sampler_gap=mean(gap),
         sampler_gap_max=float(gap.max()),

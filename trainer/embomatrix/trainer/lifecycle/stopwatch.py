@@ -16,6 +16,7 @@ class Activity(StrEnum):
     WAITING = "waiting for simulation"
     UPDATE = "update"
     SAVING = "saving"
+    PUBLISHING = "sending weights to the model server"
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,8 @@ _CURVES: Final = (
     ("success", "success of training rollouts", True),
     ("plan_steps", "executed steps per plan", False),
     ("entropy", "entropy of a token (nats)", False),
-    ("kl", "KL to the imitated policy (nats)", False),
-    ("zero_variance_groups", "groups without a signal", True),
+    ("kl", "KL to the reference policy (nats)", False),
+    ("zero_variance_groups", "zero-variance groups", True),
 )
 """Figures of a step: name, label, and whether it is a share."""
 
@@ -168,9 +168,9 @@ def _story(summary: TrainingSummary) -> str:
     return (
         f"{table or '<p>The dataset has no held-out tasks.</p>'}"
         f"<p>{outcome.imitation_steps:,} steps of imitation, then {outcome.steps:,} of GRPO with "
-        f"{outcome.rollouts:,} rollouts. The infrastructure lost {outcome.lost:,} rollouts, which are masked. "
-        f"{prewarm_share(stats)} of the announced scenes were warm in time, and {stats.shared_share:.0%} of the steps "
-        "were shared between plans.</p>"
+        f"{outcome.rollouts:,} rollouts. The infrastructure lost {outcome.lost:,} rollouts, which are left out of the loss. "
+        f"Announced scenes that were loaded before their first rollout: {prewarm_share(stats)}. Steps reused from equal "
+        f"beginnings of other plans: {stats.shared_share:.0%}.</p>"
     )
 
 

@@ -246,15 +246,17 @@ class TrainingRun:
                 progress.cursor, progress.reserve_cursor = schedule.cursor, reserve.cursor
                 progress.grpo_s += seconds
                 self._record(record, logs, seconds)
-            self._publish()
+            progress.grpo_s += self._publish()
             if progress.step % self._settings.checkpoint_every == 0:
                 self._save(updater)
 
-    def _publish(self) -> None:
-        """Give the new weights to the model server, if one samples."""
+    def _publish(self) -> float:
+        """Give the new weights to the model server, if one samples. Return the seconds that it took."""
+        began_s = time.monotonic()
         if self._server is not None:
-            with self._stopwatch.track(Activity.SAMPLING):
+            with self._stopwatch.track(Activity.PUBLISHING):
                 self._server.publish()
+        return time.monotonic() - began_s
 
     @contextlib.contextmanager
     def _rollback_on_error(self) -> Iterator[None]:

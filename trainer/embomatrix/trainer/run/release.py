@@ -12,6 +12,7 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.evaluation.intervals import mean_over_tasks, paired_difference
 from embomatrix.trainer.lifecycle.checkpoint import STATE, atomic_folder, newest_checkpoint, read_state
 from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, rates_by_task, read_outcome
+from embomatrix.trainer.policy.loading import is_word_level
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -51,7 +52,7 @@ def card_of(
     """Return the card as Markdown."""
     gain = paired_difference(rates_by_task(outcome.before), rates_by_task(outcome.after))
     lines = [
-        "# A small policy for household plans",
+        f"# {'A small policy' if is_word_level(settings.model) else 'A language model'} for household plans",
         "",
         f"Trained on {day} by `{command}`: {outcome.imitation_steps} steps of imitation and {outcome.steps} of GRPO "
         f"with {outcome.rollouts:,} rollouts, seed {settings.seed}, in {outcome.wall_s / 60:.0f} minutes. The card was written "
@@ -72,10 +73,17 @@ def card_of(
         "",
         f"Difference: {value:+.1f} points [{low:.1f}, {high:.1f}]. One seed.",
         "",
-        "It reads instructions of the words that its training tasks use, and fails at most others. It knows no scene but those "
-        "of its prompt, and was never tried on a real robot. Licence: MIT, as the package.",
+        *_about(settings),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _about(settings: TrainSettings) -> list[str]:
+    known = "It knows no scene but that of its prompt, and was never tried on a real robot."
+    if not is_word_level(settings.model):
+        return [f"Trained from `{settings.model}`, whose licence holds for these weights too. {known}"]
+    words = "It reads instructions of the words that its training tasks use, and fails at most others."
+    return [f"{words} {known} Licence: MIT, as the package."]
 
 
 def _of(rates: Sequence[TaskRate], category: str) -> list[float]:

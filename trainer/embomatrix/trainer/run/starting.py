@@ -142,8 +142,10 @@ def start_run(
 ) -> RunStart:
     """Start a new run in the folder ``out``, which is created. Raises TrainerError if it holds a run already."""
     settings = new_settings(model, settings_file, changes)
-    if "processes" not in settings.model_fields_set:
-        settings = settings.model_copy(update={"processes": _processes_for(settings)})
+    given = settings.model_fields_set
+    processes = settings.processes if "processes" in given else _processes_for(settings)
+    threads = settings.threads if "threads" in given else default_threads(processes)
+    settings = settings.model_copy(update={"processes": processes, "threads": threads})
     if any((out / CHECKPOINTS).glob("[!.]*")):
         raise TrainerError(f"{out} holds another run: pass --resume to continue it, or another --out")
     _check_free(out)
@@ -161,8 +163,8 @@ def start_run(
 
 
 def new_settings(model: str, settings_file: Path | None, changes: Mapping[str, Any]) -> TrainSettings:
-    """Return the settings of a new run, before its limits and processes are derived. Raises TrainerError."""
-    defaults = {"threads": default_threads(), **({} if is_word_level(model) else _language_defaults(model))}
+    """Return the settings of a new run, before its limits, processes and threads are derived. Raises TrainerError."""
+    defaults = {} if is_word_level(model) else _language_defaults(model)
     return read_settings(settings_file, {**changes, "model": model}, defaults)
 
 
@@ -179,9 +181,9 @@ def _check_free(out: Path) -> None:
         raise TrainerError(f"a new run would overwrite {found[0]}: pass another --out, or move it away")
 
 
-def default_threads() -> int:
-    """Half of the cores, because simulation on the same machine needs the others."""
-    return max(1, usable_cores() // 2)
+def default_threads(processes: int = 1) -> int:
+    """Threads of each process: half of the cores in all, because simulation on the same machine needs the others."""
+    return max(1, usable_cores() // 2 // processes)
 
 
 def _language_defaults(model: str) -> dict[str, Any]:
