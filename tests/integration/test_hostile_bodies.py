@@ -81,6 +81,29 @@ async def test_answers_are_parsed_in_another_process_while_the_event_loop_runs()
         parser.close()
 
 
+async def test_slow_request_does_not_end_those_behind_it(monkeypatch):
+    parser = AnswerParser()
+    running, at_once = 0, []
+
+    async def parse(body):
+        nonlocal running
+        running += 1
+        at_once.append(running)
+        await asyncio.sleep(0.01)
+        running -= 1
+        if body == b"slow":
+            raise UnavailableError("the answers could not be parsed")
+        return [body]
+
+    monkeypatch.setattr(parser, "_parse", parse)
+    found = await asyncio.gather(
+        *(parser.parse(body) for body in (b"slow", b"one", b"two")), return_exceptions=True
+    )
+    assert isinstance(found[0], UnavailableError)
+    assert found[1:] == [[b"one"], [b"two"]]
+    assert at_once == [1, 1, 1]
+
+
 async def test_parser_that_takes_too_long_is_ended_and_starts_anew():
     parser = AnswerParser(parse_s=0.0)
     with pytest.raises(UnavailableError, match="send fewer at once"):

@@ -71,7 +71,7 @@ def test_lost_plan_is_the_loss_of_all_its_rollouts(table):
 
 def test_restored_batch_continues_with_the_rollouts_that_have_no_result(table):
     table.worker(slots=4)
-    table.apply(BatchRestored(Batch("r1", "b1", 1, GROUP), {"a": 1}, 0))
+    table.apply(BatchRestored(Batch("r1", "b1", 1, GROUP), {"a": 1}, 1))
     assert table.dispatcher.pending_of("r1") == 1
     (lease,) = leases(table.apply(Tick(), after_s=10.0))
     finish(table, lease)

@@ -59,7 +59,7 @@ class Successor:
         self.dispatcher = Dispatcher(limits, lease_key=KEY, first_epoch=FIRST_EPOCH)
         self.now_s = 100.0
         cursors = {name: number + 1 for number, name in enumerate(delivered)}
-        self.first = self.apply(BatchRestored(batch(count), cursors, failures))
+        self.first = self.apply(BatchRestored(batch(count), cursors, len(cursors), failures))
 
     def apply(self, *events, after_s=0.0):
         self.now_s += after_s

@@ -53,7 +53,7 @@ def test_story_of_a_closed_run_names_time_outcomes_speed_and_scenes():
         "The run evening was open from 2026-09-21 14:13:20 UTC to 2026-09-21 14:14:50 UTC, for 90 s.",
         "2 workers completed 40 rollouts; 1 rollout ended in an infrastructure failure.",
         "Of the latest 3 failed attempts, 2 had the reason slot_crashed.",
-        "2 rollouts went to another worker, because the first one left, failed or fell silent.",
+        "Rollouts were re-dispatched 2 times, after a lease that failed, expired or was withdrawn.",
         "While there was work, 10.0 rollouts were completed per second. Half of them executed within 70 ms, "
         "99 % within 200 ms.",
         "Most of a rollout's time, 75%, passed executing plans.",

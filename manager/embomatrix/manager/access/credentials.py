@@ -125,7 +125,9 @@ class CredentialBook:
                     f"a join token cannot be valid for {valid_s:.0f} s: at most {LONGEST_JOIN_S:.0f} s"
                 )
         if len(self._by_id) >= LIMIT:
-            raise OverloadedError(f"{len(self._by_id)} tokens exist, which is the limit: revoke some")
+            raise OverloadedError(
+                f"{len(self._by_id)} tokens exist, and at most {LIMIT} may: start the manager anew, which forgets expired ones"
+            )
         secret = secrets.token_urlsafe(32)
         credential = Credential(
             token_id=_new_id(),

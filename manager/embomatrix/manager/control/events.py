@@ -128,6 +128,8 @@ class BatchRestored(Event):
     batch: Batch
     delivered: Mapping[str, int] = field(default_factory=dict)
     """Cursor of each delivered rollout."""
+    outcomes: int = 0
+    """Delivered outcomes. Equal rollouts share a cursor, and each has its outcome."""
     infra_failures: int = 0
     """Infrastructure failures among the delivered outcomes."""
 

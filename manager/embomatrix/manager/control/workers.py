@@ -58,8 +58,7 @@ class WorkerRecord:
     quarantined: bool = False
     """Audits found wrong results."""
     usable: bool = False
-    """True if it may take leases and scenes."""
-    #: Equals ``reported and not withdrawn``.
+    """True if it may take leases and scenes. Equals ``reported and not withdrawn``."""
 
     slots: int = field(init=False)
     credits: int = field(init=False)
@@ -68,9 +67,9 @@ class WorkerRecord:
     warm: frozenset[str] = frozenset()
     """Scenes that it may get leases of. Written by ``WorkerPool.set_warm`` only."""
     held: dict[str, LeaseRecord] = field(default_factory=dict)
-    #: In order of grant; the first ``slots`` run, the others are queued behind them.
+    """In order of grant; the first ``slots`` run, the others are queued behind them."""
     rendering: int = 0
-    #: Number of leases in ``held`` that render; at most ``render_slots``.
+    """Number of leases in ``held`` that render; at most ``render_slots``."""
     log_lag: float = 0.0
     """Moving average of log slowdowns against other workers."""
     penalty_s: float = 0.0
@@ -172,13 +171,13 @@ class WorkerPool:
         self.lags: dict[str, float] = {}
         """Slowdown of each slow worker."""
         self._warm_on: dict[str, dict[str, None]] = {}
-        #: Mirrors ``WorkerRecord.warm``; no empty entries.
+        """Mirrors ``WorkerRecord.warm``; no empty entries."""
         self._backlogged: dict[str, None] = {}
-        #: Workers with more leases than slots.
+        """Workers with more leases than slots."""
         self._idle: dict[str, None] = {}
-        #: Workers with ``free_slots > 0``.
+        """Workers with ``free_slots > 0``."""
         self._live: set[str] = set()
-        #: Workers that could take work now or once they have reported.
+        """Workers that could take work now or once they have reported."""
 
     def join(self, worker_id: str, resources: Resources) -> WorkerRecord:
         """Add a worker. It can take nothing until it has reported."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gzip
 import itertools
 import logging
@@ -267,8 +268,12 @@ class RunArchive:
 
     def _files(self) -> list[Path]:
         """Return the files, newest first."""
-        found = self._folder.glob(f"*{SUFFIX}")
-        return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
+        found = []
+        for path in self._folder.glob(f"*{SUFFIX}"):
+            # Another thread may remove the oldest ones meanwhile.
+            with contextlib.suppress(FileNotFoundError):
+                found.append((path.stat().st_mtime_ns, path.name, path))
+        return [path for _, _, path in sorted(found, reverse=True)]
 
     def _read(self, path: Path) -> ArchivedRun | None:
         message = self._message(path)

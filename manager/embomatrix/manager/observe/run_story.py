@@ -66,8 +66,8 @@ def _outcomes(summary: RunSummary) -> Iterator[str]:
         )
     if stats.redispatched:
         yield (
-            f"{_counted(stats.redispatched, 'rollout')} went to another worker, because the first one left, failed "
-            "or fell silent."
+            f"Rollouts were re-dispatched {_counted(stats.redispatched, 'time')}, after a lease that failed, expired or was "
+            "withdrawn."
         )
 
 

@@ -85,7 +85,7 @@ class WorkerSession:
     credential_id: str = ""
     """Token that opened the session. No other token may use it."""
     allowed_bundles: set[str] = field(default_factory=set)
-    """Bundles that the worker may fetch: those of its desired scenes and leases."""
+    """Bundles that the worker may fetch: those of all scenes and leases that the session was given."""
 
 
 class Registry:

@@ -82,7 +82,7 @@ class BatchLog:
                         await self._over.wait()
 
     async def after(self, cursor: int) -> list[ResultRow]:
-        """Wait for results after the cursor and return some of them; nothing once the batch has ended.
+        """Wait for results after the cursor, and return up to ``PER_MESSAGE`` of them; none if the batch has ended before.
 
         The wait ends with the batch, whose rollouts have deadlines, or with the caller's deadline.
         """

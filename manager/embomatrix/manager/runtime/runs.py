@@ -122,19 +122,20 @@ class Runs:
             for row in await self._store.batches(run.run_id):
                 batch = batch_of(row)
                 log = BatchLog(run.run_id, row.batch_id, row.digest, groups=group_sizes(batch))
-                failed = 0
+                outcomes = failed = 0
                 while page := await self._store.results_after(
                     run.run_id, row.batch_id, log.last_cursor, PAGE
                 ):
                     for result in page:
                         group_id, kind, count = group_and_kind(result)
                         log.ends.take(result.cursor, group_id, kind, count)
+                        outcomes += count
                         failed += count if kind is InfraFailure else 0
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}
                 self._history.submitted(batch)
-                self._feed(BatchRestored(batch, delivered, failed))
+                self._feed(BatchRestored(batch, delivered, outcomes, failed))
         self._feed(WorkersExpected(await self._store.workers()))
         if self._runs:
             logger.info("restored %d runs of a former manager", len(self._runs))

@@ -20,6 +20,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.types import Receive, Scope, Send
 
+from embomatrix.host.limits import MIB
 from embomatrix.manager.access.gate import Gate
 from embomatrix.manager.access.protection import Tls, protection_of
 from embomatrix.manager.control.cluster_state import ClusterState
@@ -54,7 +55,6 @@ logger = logging.getLogger(__name__)
 
 STOP_GRACE_S: Final = 0.5
 """Calls may finish during this time; workers and trainers then attach to the next manager."""
-MEGABYTE: Final = 1_000_000
 M_MMAP_THRESHOLD: Final = -3
 """Option of ``mallopt``."""
 LARGE_BLOCK_BYTES: Final = 256 * 1024
@@ -113,7 +113,7 @@ async def running(
     """Run a manager while the context is held. It is entered when this manager leads."""
     protection = protection_of(settings)
     with _folder_errors(settings):
-        total_bytes = settings.bundle_total_mb * MEGABYTE
+        total_bytes = settings.bundle_total_mb * MIB
         bundles = BundleStore(settings.data_dir / "bundles", total_bytes=total_bytes)
     async with contextlib.AsyncExitStack() as stack:
         # Ports are bound first: a manager that cannot serve must not take over the state.

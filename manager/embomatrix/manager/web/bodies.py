@@ -54,7 +54,7 @@ class BodyBudget:
         return bytes(body)
 
     def release(self, request: Request, size: int) -> None:
-        """Count the bytes of a body no longer."""
+        """Count the bytes of a body no longer: once for each body that was received, with its size."""
         address = request.client.host if request.client else ""
         self._held[address] -= size
         if self._held[address] <= 0:

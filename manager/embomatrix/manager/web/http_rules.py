@@ -49,7 +49,9 @@ class HttpRules:
         if self.hosts and _name_of(host) not in self.hosts:
             # Prevents DNS rebinding: a foreign page must not reach this server under its own name.
             return PlainTextResponse(
-                f"this server is not called {host[:100]!r}: add the name with `manager init --san`", 400
+                f"this manager does not answer to the host name {host[:100]!r}: open it under one of its names "
+                f"({', '.join(sorted(self.hosts))}), or add this one with `embomatrix manager init --san NAME`",
+                400,
             )
         changes = method not in READING
         if changes and self._is_foreign(headers, host):

@@ -31,11 +31,17 @@ class AnswerParser:
     def __init__(self, *, parse_s: float = PARSE_S) -> None:
         self._parse_s = parse_s
         self._pool: ProcessPoolExecutor | None = None
+        self._turn = asyncio.Lock()
+        """Held while a request is parsed: the time of a request must not include the wait for others, nor end theirs."""
 
     async def parse(self, body: bytes) -> list[Answer]:
         """Return the answers of a request in order. Raises InvalidRequestError for a malformed request, and
         UnavailableError if its texts take too much time or memory.
         """
+        async with self._turn:
+            return await self._parse(body)
+
+    async def _parse(self, body: bytes) -> list[Answer]:
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(1, context, initializer=_limit_memory, initargs=(MEMORY_MB,))

@@ -186,7 +186,7 @@ class AnnounceLookaheadRequest(google.protobuf.message.Message):
     ENTRIES_FIELD_NUMBER: builtins.int
     run_id: builtins.str
     version: builtins.int
-    """Windows with a lower version than the last one are ignored."""
+    """A window replaces the last one if its version is higher. Otherwise it is ignored, and the answer is still about its scenes."""
     @property
     def entries(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LookaheadEntry]: ...
     def __init__(

@@ -152,7 +152,9 @@ class SkillCall(google.protobuf.message.Message):
     source_index: builtins.int
     relation: builtins.str
     yaw: builtins.float
+    """Radians."""
     distance: builtins.float
+    """Metres."""
     room_name: builtins.str
     def __init__(
         self,
@@ -665,12 +667,13 @@ class Resources(google.protobuf.message.Message):
     cores: builtins.int
     memory_mb: builtins.int
     score: builtins.float
+    """Speed of one core; 1 is a core of a cloud machine of 2026."""
     gpu: builtins.str
     vram_mb: builtins.int
     disk_mb: builtins.int
     """Free space for bundles."""
     render_slots: builtins.int
-    """Slots that render on the GPU; gated by vram_mb."""
+    """Slots that render on the GPU; as many as fit into vram_mb."""
     @property
     def versions(self) -> google.protobuf.internal.containers.ScalarMap[builtins.str, builtins.str]: ...
     @property

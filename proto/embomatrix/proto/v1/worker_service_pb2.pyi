@@ -488,6 +488,7 @@ class HeartbeatRequest(google.protobuf.message.Message):
     session_id: builtins.str
     session_epoch: builtins.int
     load: builtins.float
+    """Share of the slots that are busy, 0 to 1."""
     memory_used_mb: builtins.int
     @property
     def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]:

@@ -256,8 +256,8 @@ class Child(Zygote):
         self.kill()
         try:
             return await self._parent.reap(self.pid)
-        except ProcessGoneError:
-            return "died with the process that it was forked from"
+        except ProcessGoneError as error:
+            return f"its exit status is unknown: {error}"
 
 
 class Root(Zygote):

@@ -24,6 +24,7 @@ from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome
 
+NOT_CONFIRMED: Final = "the second execution that should have confirmed the result was cancelled"
 LOOKED_AT: Final = 256
 """Audits examined at each tick, in rotation."""
 
@@ -126,7 +127,7 @@ def _check_ended(state: DispatchState, check: RolloutRecord, outcome: Outcome) -
         else:
             failed = isinstance(outcome, InfraFailure)
             _close_and_deliver(
-                state, case, outcome if failed else InfraFailure(InfraCode.DEADLINE, "no audit")
+                state, case, outcome if failed else InfraFailure(InfraCode.DEADLINE, NOT_CONFIRMED)
             )
         return
     versions = state.pool.workers[outcome.worker_id].resources.versions
@@ -199,7 +200,7 @@ def _end_in_mismatch(state: DispatchState, case: AuditCase) -> None:
     """End a case undecided: a held rollout fails, and no worker is blamed."""
     _count(state, case, mismatch=True)
     names = ", ".join(opinion.worker_id for opinion in case.opinions)
-    message = f"{names} came to different results, and no two others agree with either"
+    message = f"{names} returned different results, and no third worker agrees with one of them"
     _close_and_deliver(state, case, InfraFailure(InfraCode.RESULT_MISMATCH, message))
 
 

@@ -54,7 +54,7 @@ class LeaseTable:
         first_epoch: int = 1,
     ) -> None:
         self.live: dict[str, LeaseRecord] = {}
-        #: Equals the union of ``WorkerRecord.held`` over all workers.
+        """Equals the union of ``WorkerRecord.held`` over all workers."""
         self.expired = 0
         """Leases that expired, so far."""
         self.in_use: Counter[tuple[str, str]] = Counter()
@@ -69,7 +69,7 @@ class LeaseTable:
         self._epochs = itertools.count(first_epoch)
         self._entries = itertools.count()
         self._due: list[tuple[float, int, LeaseRecord]] = []
-        #: Has an entry for each live lease, at or before its ``due_s``; ended leases leave it at the head.
+        """Has an entry for each live lease, at or before its ``due_s``; ended leases leave it at the head."""
         self._ended: OrderedDict[str, str] = OrderedDict()
         """Run ids of ended leases, by lease id."""
 

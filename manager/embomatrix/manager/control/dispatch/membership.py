@@ -81,9 +81,12 @@ def standing_changed(state: DispatchState, event: Standing) -> None:
 
 
 def restore_batch(state: DispatchState, event: BatchRestored) -> None:
-    """Take over a batch of a former manager. Its counters and cursors continue; its rollouts wait for claims."""
+    """Take over a batch of a former manager. Its cursors continue, and the run's counts of delivered outcomes and failures.
+
+    Other counters begin at 0. Its open rollouts wait for claims.
+    """
     counters = state.runs.of(event.batch.run_id).counters
-    counters.delivered += len(event.delivered)
+    counters.delivered += event.outcomes
     counters.infra_failures += event.infra_failures
     batch = open_batch(state, event.batch, event.delivered)
     for record in state.batches.admit(batch) if batch is not None else ():

@@ -20,11 +20,11 @@ class PendingQueues:
     def __init__(self, turn: Callable[[RolloutRecord], FairShareTurn]) -> None:
         self._turn = turn
         self._heaps: dict[str, dict[QueueKey, _Heap]] = {}
-        #: Entries whose record is not PENDING are stale and skipped at the head.
+        """Entries whose record is not PENDING are stale and skipped at the head."""
         self._counts: Counter[str] = Counter()
-        #: Waiting records by scene; no zero entries.
+        """Waiting records by scene; no zero entries."""
         self._by_run: Counter[str] = Counter()
-        #: Waiting rollouts by run; no zero entries.
+        """Waiting rollouts by run; no zero entries."""
         self._numbers = itertools.count()
 
     def __len__(self) -> int:

@@ -56,18 +56,18 @@ class RolloutRecord:
     attempts: int = 0
     """Leases that started and brought no result."""
     leases: list[LeaseRecord] = field(default_factory=list)
-    #: At most one live lease, or two on different workers if ``hedged``. Empty unless ``phase`` is LEASED.
+    """At most one live lease, or two on different workers if ``hedged``. Empty unless ``phase`` is LEASED."""
     hedged: bool = False
     out_of_memory: bool = False
     """An attempt ran out of memory: the rollout is never hedged."""
     failed_on: str = ""
+    """Worker of the last failed attempt; empty before."""
     avoid_until_s: float = -math.inf
-    """Worker of the last failed attempt, which gets the rollout again only after this time."""
+    """Monotonic time from which ``failed_on`` may get the rollout again."""
     held: bool = False
-    #: Only while ``phase`` is LEASED and ``leases`` is empty.
-    """Executed; the result waits until another worker has confirmed it."""
+    """Executed; the result waits until another worker has confirmed it. Only in phase LEASED, without ``leases``."""
     check: bool = False
-    #: A check is in no batch; its audit case owns it.
+    """A check is in no batch; its audit case owns it."""
     excluded_workers: frozenset[str] = frozenset()
     """Workers whose results a check verifies: they may not execute it."""
     reward: RewardSettings = PAPER

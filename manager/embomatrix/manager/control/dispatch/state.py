@@ -79,7 +79,7 @@ class AuditCase:
     held: RolloutRecord | None
     """The rollout while its result is held back; None once it was delivered."""
     check: RolloutRecord
-    #: Waits, runs, or can be done by no worker at the moment; never DONE.
+    """Waits, runs, or can be done by no worker at the moment; never DONE."""
     opinions: list[Opinion]
     results: list[Completed]
     """Results of a held rollout, parallel to ``opinions``: one of them will be delivered."""
@@ -211,7 +211,7 @@ class DispatchState:
         self.awaited: dict[RolloutKey, RolloutRecord] = {}
         """Restored rollouts that a worker may still hold under a former manager's lease."""
         self.awaited_scenes: Counter[str] = Counter()
-        #: Scenes of ``awaited``, counted; rollouts that got an outcome meanwhile stay counted until the wait ends.
+        """Scenes of ``awaited``, counted; rollouts that got an outcome meanwhile stay counted until the wait ends."""
         self.awaited_until_s = 0.0
         self.expected_workers: set[str] | None = None
         """Workers of the former manager that have not reported yet; None while unknown."""

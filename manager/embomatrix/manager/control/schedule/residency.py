@@ -29,7 +29,7 @@ class WorkerResidency:
 
     worker: WorkerRecord
     residents: dict[str, Resident] = field(default_factory=dict)
-    #: From the most to the least recently used.
+    """From the most to the least recently used."""
     warm_since_s: dict[str, float] = field(default_factory=dict)
     loading_since_s: dict[str, float] = field(default_factory=dict)
     failed_s: dict[str, float] = field(default_factory=dict)
@@ -43,7 +43,7 @@ class WorkerResidency:
     """The last desired set; None if the worker may not have received it."""
     score_limit: float = math.inf
     listed: bool = False
-    #: True while the worker is in ``Residencies.order``.
+    """True while the worker is in ``Residencies.order``."""
 
     @property
     def worker_id(self) -> str:
@@ -126,16 +126,16 @@ class Residencies:
     def __init__(self) -> None:
         self.by_id: dict[str, WorkerResidency] = {}
         self.order: list[tuple[float, str]] = []
-        #: Usable workers as (-capacity, id), ascending.
+        """Usable workers as (-capacity, id), ascending."""
         self.slots = 0
-        #: Slots of the workers in ``order``.
+        """Slots of the workers in ``order``."""
         self.fresh: set[str] = set()
         """Usable workers that changed since the last placement."""
         self.failing: set[str] = set()
-        #: Workers with ``failed_s``.
+        """Workers with ``failed_s``."""
         self._assigned: dict[str, frozenset[str]] = {}
         self._assigned_on: dict[str, set[str]] = {}
-        #: Inverse of ``_assigned``; no empty entries.
+        """Inverse of ``_assigned``; no empty entries."""
         self._memory_mb: Counter[int] = Counter()
         self._slow: set[str] = set()
 
