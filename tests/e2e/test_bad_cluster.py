@@ -198,6 +198,15 @@ def test_training_reports_interrupts_and_write_errors(kitchen, tmp_path):
             )
         newest = max((tmp_path / "late" / "checkpoints").iterdir())
         assert newest.name.startswith("step-")
+        resumed = ("--resume", "--steps=1000000", f"--out={tmp_path / 'late'}")
+        with background(tmp_path / "resumed.log", *common, *resumed) as run_:
+            run_.wait_for("GRPO")
+            assert_ended(
+                run_.terminate(), 130, f"interrupted: continue with `--resume --out={tmp_path / 'late'}`"
+            )
+        shown = run("cluster", "runs", f"--manager={address}")
+        assert_ended(shown, 0, "closed")
+        assert "open" not in shown.text
         full = run_anew(
             *common,
             f"--out={tmp_path / 'full'}",

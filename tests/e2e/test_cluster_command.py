@@ -141,6 +141,18 @@ async def test_reports_are_found_by_name_and_an_ambiguous_name_lists_the_ids(tmp
     assert "2 runs are named 'morning': pass the id of one, r4 or r1;" in twice.text
 
 
+async def test_run_of_a_killed_trainer_is_closed_by_name(tmp_path):
+    async with manager(tmp_path) as at, ClusterClient(at.address) as client:
+        there = f"--manager={at.address}"
+        await client.open_run("evening", "r1")
+        closed = await cluster_command("close", "evening", there)
+        assert (closed.status, closed.text) == (0, "run r1, state closed, delivered 0")
+        again = await cluster_command("close", "evening", there)
+        assert (again.status, "run 'r1' is not open" in again.text) == (2, True)
+        (kept,) = json.loads((await cluster_command("runs", "--closed", "--json", there)).text)
+    assert kept["run_id"] == "r1"
+
+
 async def test_operator_drains_and_resumes_a_worker_and_pauses_dispatch(tmp_path):
     async with (
         manager(tmp_path) as at,

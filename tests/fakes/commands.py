@@ -154,6 +154,11 @@ class Background:
         os.killpg(self.process.pid, signal.SIGINT)
         return self.end()
 
+    def terminate(self):
+        """Send SIGTERM to the whole process group, as `timeout` and schedulers do."""
+        os.killpg(self.process.pid, signal.SIGTERM)
+        return self.end()
+
     def end(self):
         return CommandResult(self.process.wait(timeout=LIMIT_S), self.text)
 

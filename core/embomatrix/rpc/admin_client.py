@@ -11,11 +11,12 @@ from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
 import grpc
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
-from embomatrix.proto.v1 import admin_service_pb2_grpc
+from embomatrix.proto.v1 import admin_service_pb2_grpc, rollout_service_pb2, rollout_service_pb2_grpc
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
 from embomatrix.rpc.managers import FAILOVER_S, Managers
 from embomatrix.rpc.status import InvalidRequestError, UnavailableError, cluster_errors
 from embomatrix.rpc.wire.codec import each, inside
+from embomatrix.rpc.wire.run import run_stats_from_proto
 from embomatrix.rpc.wire.run_log import (
     EventPage,
     RolloutExplanation,
@@ -27,7 +28,7 @@ from embomatrix.rpc.wire.run_log import (
 )
 from embomatrix.rpc.wire.session import plan_cell_from_proto, run_info_from_proto, worker_info_from_proto
 from embomatrix.rpc.wire.tokens import ROLE_NUMBERS, AccessRole, TokenInfo, token_info_from_proto
-from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, WorkerInfo
+from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, RunStats, WorkerInfo
 
 CALL_S: Final = 10.0
 """Default time limit of one call."""
@@ -130,6 +131,14 @@ class AdminClient:
         """Return the totals of an open or archived run. Raises NotFoundError."""
         answer = await self._admin.GetRun(pb.GetRunRequest(run_id=run_id), timeout=self._call_s)
         return inside("summary", run_summary_from_proto, answer)
+
+    @of_the_leader
+    async def close_run(self, run_id: str) -> RunStats:
+        """Close an open run, for example of a trainer that was killed, and return its counters. Raises NotFoundError."""
+        stub = rollout_service_pb2_grpc.RolloutServiceStub(self._channel)
+        request = rollout_service_pb2.CloseRunRequest(run_id=run_id)
+        answer = await stub.CloseRun(request, timeout=self._call_s)
+        return inside("stats", run_stats_from_proto, answer.stats)
 
     async def find_run(self, run: str) -> str:
         """Return the id of the run with this id or name; the text itself if there is none.

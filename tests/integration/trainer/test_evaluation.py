@@ -20,10 +20,11 @@ from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, Evaluatio
 from embomatrix.trainer.evaluation.baselines import PLANNERS, BaselineName, fitted_scripts
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam, success_by_level
+from embomatrix.trainer.evaluation.intervals import paired_difference
 from embomatrix.trainer.evaluation.judging import judge_answers
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
-from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
+from embomatrix.trainer.evaluation.table import difference_row, rates_of, read_row, report_of, text_report
 from embomatrix.worker.slots.rollout_pool import RolloutPool
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.difficulty import Difficulty
@@ -217,6 +218,26 @@ def test_report_on_other_tasks_is_rejected_as_a_row(bench, tmp_path):
         read_row(path, "sha256:0")
     value["overall"]["success"]["value"] = 10**400
     path.write_text(json.dumps(value))
+    with pytest.raises(TrainerError, match="is not an evaluation report"):
+        read_row(path, bench.digest)
+
+
+def test_difference_to_another_report_is_paired_by_task(bench, tmp_path):
+    good, _ = report(bench, asked(bench, BaselineName.ORACLE))
+    bad, _ = report(bench, asked(bench, BaselineName.RANDOM, 2))
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps(bad))
+    other = read_row(path, bench.digest)
+    change = paired_difference(rates_of(bad), rates_of(good))
+    cells = difference_row(good, other)
+    assert cells[1] == f"{100 * change.value:+.1f} [{100 * change.low:.1f}, {100 * change.high:.1f}]"
+    assert change.value == good["overall"]["success"]["value"] - bad["overall"]["success"]["value"] > 0
+    text = text_report(good, [other])
+    assert "success minus that of others on the same tasks, points" in text
+    assert cells[1] in text
+    assert "minus that of others" not in text_report(good)
+    del bad["verdicts"][0]["samples"][0]["success"]
+    path.write_text(json.dumps(bad))
     with pytest.raises(TrainerError, match="is not an evaluation report"):
         read_row(path, bench.digest)
 

@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
+from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts, sigterm_as_ctrl_c
 
 
 def interrupt():
@@ -25,6 +25,22 @@ def test_first_ctrl_c_is_deferred_and_the_second_is_immediate(times, is_whole):
     with pytest.raises(KeyboardInterrupt):
         whole()
     assert bool(done) is is_whole
+
+
+def test_sigterm_counts_as_ctrl_c_within_the_block():
+    before = signal.getsignal(signal.SIGTERM)
+    done = []
+
+    def ended():
+        with sigterm_as_ctrl_c(), DeferredInterrupts() as interrupts:
+            interrupts.defer()
+            signal.raise_signal(signal.SIGTERM)
+            done.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        ended()
+    assert done
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_interrupts_are_deferred_only_inside_the_block():

@@ -164,6 +164,15 @@ async def trace(client: AdminClient, run: Run, out: Out = None, force: Force = F
 
 @app.command()
 @manager_command("cluster")
+async def close(client: AdminClient, run: Run, as_json: AsJson = False) -> None:
+    """Close an open run whose trainer will not come back: its rollouts are cancelled, and no scene is kept for it."""
+    run_id = await client.find_run(run)
+    stats = await client.close_run(run_id)
+    _done(as_json, run=run_id, state="closed", delivered=str(stats.delivered))
+
+
+@app.command()
+@manager_command("cluster")
 async def drain(client: AdminClient, name: Worker, as_json: AsJson = False) -> None:
     """Drain a worker: it finishes its leases and gets nothing new."""
     await client.drain_worker(name)

@@ -253,12 +253,14 @@ def _show_limits(start: RunStart) -> None:
 
 @contextlib.contextmanager
 def _report_errors(command: str, out: Path | None = None) -> Iterator[None]:
-    """Print errors as one sentence: status 2, or 130 for Ctrl-C. ``out`` is the run's folder."""
+    """Print errors as one sentence: status 2, or 130 for Ctrl-C and SIGTERM. ``out`` is the run's folder."""
     from embomatrix.rpc.status import ClusterError
+    from embomatrix.trainer.lifecycle.interrupts import sigterm_as_ctrl_c
 
     logging.getLogger("embomatrix").addHandler(logging.NullHandler())
     try:
-        yield
+        with sigterm_as_ctrl_c():
+            yield
     except (TrainerError, ClusterError) as error:
         fail(command, str(error))
     except KeyboardInterrupt:

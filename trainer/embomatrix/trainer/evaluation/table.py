@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.trainer.config.errors import TrainerError
+from embomatrix.trainer.evaluation.intervals import paired_difference
 from embomatrix.trainer.evaluation.scoreboard import estimate_to_json
 from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
 from embomatrix.world.json_text import parse_json
@@ -67,8 +69,10 @@ def read_row(path: Path, bench_digest: str) -> ScoreRow:
                 f"the report {path} has another version (found {version!r}, expected {VERSION}): evaluate its answers again"
             )
         label, digest = str(setup["model"]), setup["bench_digest"]
-        row = ScoreRow(label, {"overall": value["overall"], "categories": value["categories"]})
+        shown = {name: value[name] for name in ("overall", "categories", "verdicts")}
+        row = ScoreRow(label, shown)
         table([row], "success")
+        rates_of(shown)
     except OSError as error:
         raise TrainerError(
             f"the report {path} can't be read ({error.strerror}): expected the report.json of an evaluation"
@@ -103,6 +107,26 @@ def table(rows: Iterable[ScoreRow], figure: str) -> list[tuple[str, ...]]:
         )
         for row in rows
     ]
+
+
+def rates_of(figures: Mapping[str, Any], category: TaskCategory | None = None) -> dict[str, float]:
+    """Share of successful samples of each task of a category; NaN if all were lost. None: of all tasks."""
+    found = {}
+    for task in figures["verdicts"]:
+        known = [bool(sample["success"]) for sample in task["samples"] if not sample.get("lost")]
+        if category in (None, task["category"]):
+            found[str(task["task"])] = sum(known) / len(known) if known else math.nan
+    return found
+
+
+def difference_row(report: Mapping[str, Any], other: ScoreRow) -> tuple[str, ...]:
+    """Row of the differences in success between a report and another one, paired by task, with their intervals."""
+    cells = []
+    for category in (None, *COLUMNS):
+        change = paired_difference(rates_of(other.figures, category), rates_of(report, category))
+        value, low, high = (100 * each for each in (change.value, change.low, change.high))
+        cells.append(NONE if math.isnan(value) else f"{value:+.1f} [{low:.1f}, {high:.1f}]")
+    return (other.label, *cells)
 
 
 def percent(estimate: Mapping[str, Any]) -> str:
@@ -147,10 +171,13 @@ def cause_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
 def score_tables(report: Mapping[str, Any], beside: Sequence[ScoreRow] = ()) -> tuple[ReportTable, ...]:
     """Tables of success, partial credit and pass@k. ``beside`` are the rows of other reports on the same tasks."""
     rows, titles = [ScoreRow(report["setup"]["model"], report), *beside], head(report)
+    differences = [difference_row(report, other) for other in beside]
+    paired = "success minus that of others on the same tasks, points"
     partial = "partial credit (share of subgoals that hold at the end), %"
     passes = [("", *titles[1:]), *pass_rows(report)]
     return (
         ReportTable("success, %", [titles, *table(rows, "success")]),
+        *([ReportTable(paired, [("minus", *titles[1:]), *differences])] if differences else []),
         ReportTable(partial, [titles, *table(rows, "partial")]),
         ReportTable("probability that at least one of k samples succeeds, %", passes),
     )

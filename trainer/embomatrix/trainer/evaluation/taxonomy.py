@@ -34,7 +34,7 @@ class Cause(StrEnum):
 
 MEANINGS: Final[Mapping[Cause, str]] = {
     Cause.UNPARSABLE: "the text contains no plan, or a plan that is too long",
-    Cause.HALLUCINATED_SKILL: "the plan calls a skill that does not exist",
+    Cause.HALLUCINATED_SKILL: "the plan calls a skill that the task does not offer",
     Cause.WRONG_ARGUMENT: "an argument of a call is missing or of the wrong kind",
     Cause.HALLUCINATED_OBJECT: "a step names an object or a room that does not exist",
     Cause.AFFORDANCE: "a step asks an object for something that it can never do",

@@ -197,12 +197,13 @@ class _Requests:
 def _serve(
     connection: Connection, settings: dict[str, Any], folder: Path, weights: Any, gradient: Any
 ) -> None:
-    """Answer requests until the trainer closes the connection. The trainer handles Ctrl-C for all processes.
+    """Answer requests until the trainer closes the connection. The trainer handles Ctrl-C and SIGTERM for all processes.
 
     ``folder`` holds the policy, whose weights are replaced by the shared ones; ``weights`` and ``gradient`` are descriptors
     from DupFd.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     requests: _Requests | None = None
     while True:
         try:

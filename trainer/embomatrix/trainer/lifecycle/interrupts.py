@@ -1,9 +1,27 @@
-"""Deferred Ctrl-C: a policy that was updated by half can't be resumed."""
+"""Ctrl-C, which is deferred while a policy is updated by half, and SIGTERM, which counts as Ctrl-C."""
 
+import contextlib
 import signal
 import threading
+from collections.abc import Iterator
 from types import FrameType, TracebackType
 from typing import Any, Self
+
+
+@contextlib.contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Treat SIGTERM as Ctrl-C within the block. Schedulers, containers and `timeout` end a program by it.
+
+    Has no effect outside the main thread, which alone receives signals.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class DeferredInterrupts:

@@ -104,6 +104,10 @@ class TrainingRun:
         if newest is not None:
             restore(newest, functools.partial(self._load_tensors, updater))
         self._recorder.forget_after(self._progress.step, METRICS, SAMPLES, EVALUATIONS)
+        if newest is None:
+            self._save(
+                updater
+            )  # a kill before the first checkpoint of GRPO must not cost the end of imitation
         try:
             self._optimise(updater, workers)
         except BaseException:
