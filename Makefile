@@ -10,10 +10,13 @@ ARGS ?=
 
 DEFAULT_TESTS := not slow and not docker and not hf and not eai and not peers
 
-.PHONY: run test test-unit test-slow test-random test-random-hour fuzz house lint types contracts proto proto-check check site diagrams compose-check wheel physics-wheel pictures clean
+.PHONY: run install test test-unit test-slow test-random test-random-hour fuzz house lint types contracts proto proto-check check site diagrams compose-check wheel physics-wheel pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
+
+# EmboMatrix in the virtual environment, without training.
+install: $(VENV)/.runtime
 
 # All default tests, one process per core and at most eight. Tests of one file share costly fixtures, so a file stays in one
 # process. `ARGS=-n0` runs everything in one process and shows what tests print.

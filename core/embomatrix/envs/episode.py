@@ -16,8 +16,9 @@ from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.prompt import Codec, Prompt, Situation, prompt_for, situation_of
 from embomatrix.skills.syntax import MAX_STEPS, Plan, SkillCall
 from embomatrix.skills.trace import Step, Trace
+from embomatrix.starter.shipped import dataset_named
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.dataset import Dataset, TaskRecord
+from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
@@ -99,7 +100,7 @@ class Episode:
 
 
 class Household:
-    """Context manager over a dataset's tasks. Scenes are loaded on demand and a few are kept.
+    """Context manager over the tasks of a dataset, a folder or one that ships by its name. A few scenes are kept loaded.
 
     Raises DatasetError for a folder without a dataset, EngineError for a scene that can't be loaded.
     """
@@ -110,7 +111,7 @@ class Household:
         reward: RewardSettings = PAPER,
         simulate: Callable[[Bundle], Simulator] = load_simulator,
     ) -> None:
-        self._dataset = Dataset.load(dataset)
+        self._dataset = dataset_named(str(dataset))
         self._reward = reward
         self._simulate = simulate
         self._scenes: OrderedDict[str, tuple[Bundle, Simulator]] = OrderedDict()

@@ -1,4 +1,4 @@
-"""Gymnasium environment: an action is one skill call, an observation is text, and an episode's rewards add up to its plan's.
+"""Gymnasium environment: an action is one skill call, an observation a dict of texts, and rewards add up to a plan's.
 
 Needs ``gymnasium``, which no other module needs. The import registers ``ENV_ID``, so after it
 ``gymnasium.make("EmboMatrix/Household-v0", dataset="build/dataset")`` works.
@@ -134,7 +134,8 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         except PlanError as error:
             self._message = str(error)
             over = episode.skip()
-            return self._observed(episode), unparsable().total, False, over, {"failure": "unparsable"}
+            info = {"failure": "unparsable", "success": False}
+            return self._observed(episode), unparsable().total, False, over, info
         outcome = episode.act(call)
         self._message = outcome.step.message
         success = outcome.reward.success

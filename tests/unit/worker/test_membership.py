@@ -6,7 +6,7 @@ import pytest
 
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.worker.host.settings import WorkerSettings
-from embomatrix.worker.link.membership import Membership, MembershipFile, membership_of
+from embomatrix.worker.link.membership import Membership, MembershipFile, authority_of, membership_of
 
 KEPT = Membership("lab.example:50070", "spare", "own.credential", b"PEM")
 
@@ -29,6 +29,14 @@ async def test_invitation_is_identified_by_its_token_and_may_change_the_address(
     found = await membership_of(moved)
     assert (found.manager, found.name, found.token) == ("moved.example:50070", "spare", "own.credential")
     assert not found.joining
+
+
+def test_authority_of_a_joined_manager_is_found_by_its_address(tmp_path):
+    assert authority_of("lab.example:50070", tmp_path / "nowhere") == b""
+    (tmp_path / "member-0.json").write_text("{}")
+    MembershipFile(tmp_path, "join.secret").keep(KEPT)
+    assert authority_of("lab.example:50070", tmp_path) == b"PEM"
+    assert authority_of("other.example:50070", tmp_path) == b""
 
 
 def test_each_token_has_a_private_file_that_does_not_name_it(tmp_path):

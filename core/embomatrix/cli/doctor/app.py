@@ -41,7 +41,10 @@ def doctor(
         secret, trusted = read_token(token), read_ca(ca)
     except ClusterError as error:
         fail("doctor", str(error))
-    visits = [Visit(address, secret, trusted, page_port, expected=bool(manager)) for address in addresses]
+    visits = [
+        Visit(address, secret, trusted or _joined_authority(address), page_port, expected=bool(manager))
+        for address in addresses
+    ]
     findings_by_visit = asyncio.run(_visit(visits))
     held = frozenset().union(
         *(ports_held(visit, found) for visit, found in zip(visits, findings_by_visit, strict=True))
@@ -55,9 +58,24 @@ def doctor(
         raise SystemExit(MENDABLE)
 
 
+def _is_worker() -> bool:
+    """Return whether the worker's packages are installed."""
+    return all(importlib.util.find_spec(name) for name in NEEDED["worker"])
+
+
+def _joined_authority(address: str) -> bytes:
+    """Return the authority of a manager that a worker of this machine has joined by invitation; empty without one."""
+    if not _is_worker():
+        return b""
+    from embomatrix.worker.host.settings import WorkerSettings
+    from embomatrix.worker.link.membership import authority_of
+
+    return authority_of(address, WorkerSettings.model_validate({}).state_dir)
+
+
 def _as_worker() -> Iterator[Finding]:
     """Yield findings about this machine as a worker, if the worker's packages are installed."""
-    if all(importlib.util.find_spec(name) for name in NEEDED["worker"]):
+    if _is_worker():
         from embomatrix.cli.doctor.worker import worker
 
         yield from worker()

@@ -194,8 +194,8 @@ def _tell(imported: ImportedAsset, path: Path) -> None:
     asset = imported.asset
     parts = sum(len(link.parts) for link in asset.links)
     say(
-        f"{asset.asset_id}: {parts} convex parts in {len(asset.links)} links, {len(asset.supports)} surfaces, "
-        f"{len(asset.interiors)} cavities: {path}"
+        f"{asset.asset_id}: convex parts {parts}, links {len(asset.links)}, surfaces {len(asset.supports)}, cavities "
+        f"{len(asset.interiors)}: {path}"
     )
     for lack in imported.lacks:
         say(lack)

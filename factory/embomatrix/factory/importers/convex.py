@@ -88,7 +88,7 @@ class Coacd:
             import coacd
         except ImportError:
             raise ModelFileError(
-                "coacd is not installed: `pip install embomatrix[importers]`, or cut by components (--cut components)"
+                "coacd is not installed: `pip install '.[importers]'` in the checkout, or cut by components (--cut components)"
             ) from None
         coacd.set_log_level("error")
         # CoACD's thresholds are shares of the size, so the mesh is scaled to the unit cube.

@@ -43,6 +43,9 @@ def host_steps(data_dir: Path, *, named: bool) -> tuple[NextStep, ...]:
         NextStep(
             "serve, with the tasks in the dashboard", shlex.join((*serve, f"--dataset={DEFAULT_DATASET}"))
         ),
-        NextStep("check the connection from another machine", "embomatrix doctor"),
+        NextStep(
+            "check the connection from this machine; on another, with its own copy of ca.pem and with --manager HOST:PORT",
+            shlex.join(("embomatrix", "doctor", *access)),
+        ),
         NextStep("train on the tasks, with the results in runs/first", shlex.join(train)),
     )

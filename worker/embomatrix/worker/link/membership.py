@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fetch_ca, read_ca, read_token
 from embomatrix.world.json_text import parse_json
@@ -60,6 +62,16 @@ class MembershipFile:
             "ca": membership.ca.decode("ascii"),
         }
         write_whole(self._path, json.dumps(kept).encode("ascii"), mode=0o600)
+
+
+def authority_of(manager: str, folder: Path) -> bytes:
+    """Return the authority of a manager that a worker of this machine has joined; empty without one."""
+    for path in sorted(folder.expanduser().glob("member-*.json")):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            kept = parse_json(path.read_bytes())
+            if manager in Managers(kept["manager"]).addresses:
+                return bytes(kept["ca"].encode("ascii"))
+    return b""
 
 
 async def membership_of(settings: WorkerSettings) -> Membership:
