@@ -23,7 +23,7 @@ from embomatrix.bench.experiments.design import (
     parse_settings,
     toml_of,
 )
-from embomatrix.bench.experiments.findings import Run, curve, figures_of, findings_of
+from embomatrix.bench.experiments.findings import Run, curve, difference, figures_of, findings_of
 from embomatrix.bench.experiments.section import add_section, learning_section
 from embomatrix.cli.local_cluster import no_problem
 from embomatrix.trainer.config.errors import TrainerError
@@ -106,6 +106,28 @@ def test_figures_have_the_names_of_the_ablation():
     assert figures["overhead_ratio"].value == pytest.approx(0.1)
     assert not figures["success_after"].is_reached
     assert figures["success_gain"].is_reached
+
+
+def test_other_arms_are_compared_with_the_first_by_seed_and_task():
+    first = findings_of(
+        "plain", [run(0, "plain", (0.0, 0.0, 0.0), (0.2, 0.4, 0.6)), run(1, "plain", (0.0,), (0.5,))]
+    )
+    other = findings_of("fast", [run(0, "fast", (0.0, 0.0, 0.0), (0.3, 0.4, 0.8))])
+    change = difference(first, other)
+    assert change.value == pytest.approx(0.1)
+    assert change.low < 0.1 < change.high
+    figures = {figure.name: figure.value for figure in figures_of([first, other])}
+    names = ("success_difference_fast", "success_difference_fast_low", "success_difference_fast_high")
+    assert [figures[name] for name in names] == [change.value, change.low, change.high]
+
+
+def test_gain_of_equal_tasks_is_not_certain():
+    figures = {
+        figure.name: figure
+        for figure in figures_of([findings_of("a", [run(0, "a", (0.0, 0.0), (0.0, 0.0))])])
+    }
+    assert figures["success_gain_low"].value < 0
+    assert not figures["success_gain_low"].is_reached
 
 
 def test_curve_has_ten_parts_or_one_per_step():

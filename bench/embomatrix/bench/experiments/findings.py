@@ -10,7 +10,7 @@ import numpy as np
 
 from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE, Design
 from embomatrix.pages.figures import Better, Figure, Interval
-from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.trainer.evaluation.intervals import bootstrap, mean_difference
 from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 
@@ -71,8 +71,23 @@ def findings_of(name: str, runs: Sequence[Run]) -> ArmFindings:
         for then, now in zip(before, after, strict=True)
     ]
     return ArmFindings(
-        name, tuple(runs), *(bootstrap(_over_seeds(rates)) for rates in (before, after, gains))
+        name,
+        tuple(runs),
+        bootstrap(_over_seeds(before)),
+        bootstrap(_over_seeds(after)),
+        mean_difference(_over_seeds(gains)),
     )
+
+
+def difference(first: ArmFindings, other: ArmFindings) -> Interval:
+    """Success of another arm after GRPO minus that of the first one, paired by seed and task."""
+    known = {run.seed: by_task(run.outcome.after) for run in first.runs}
+    differences = [
+        {task: rate - known[run.seed][task] for task, rate in now.items() if task in known[run.seed]}
+        for run in other.runs
+        if run.seed in known and (now := by_task(run.outcome.after))
+    ]
+    return mean_difference(_over_seeds(differences))
 
 
 def by_task(rates: Sequence[TaskRate]) -> dict[str, float]:
@@ -96,7 +111,7 @@ def curve(run: Run, key: str) -> tuple[float, ...]:
 
 
 def figures_of(arms: Sequence[ArmFindings]) -> tuple[Figure, ...]:
-    """Figures of an experiment; those of the first arm have the plain names."""
+    """Figures of an experiment; those of the first arm have the plain names, and the others are compared with it."""
     first = arms[0]
     tasks = len(_over_seeds([by_task(run.outcome.after) for run in first.runs]))
     count = tasks * len(first.runs)
@@ -110,6 +125,9 @@ def figures_of(arms: Sequence[ArmFindings]) -> tuple[Figure, ...]:
         known = {WITHOUT_RELEVANCE: "success_after_no_relevance"}
         name = known.get(arm.name, f"success_after_{arm.name}")
         found.append(Figure(name, arm.after.value, "", Better.NEITHER, tasks * len(arm.runs)))
+        change = difference(first, arm)
+        for end, value in (("", change.value), ("_low", change.low), ("_high", change.high)):
+            found.append(Figure(f"success_difference_{arm.name}{end}", value, "", Better.NEITHER, tasks))
     steps = sum(run.outcome.steps for run in first.runs)
     found += [
         Figure("sim_wait_share", first.wait_share, "", Better.LOWER, steps, MOST_WAIT),

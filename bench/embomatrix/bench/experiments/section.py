@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from embomatrix.bench.experiments.design import Design
-from embomatrix.bench.experiments.findings import BINS, ArmFindings, Run, by_task, curve
+from embomatrix.bench.experiments.findings import BINS, ArmFindings, Run, by_task, curve, difference
 from embomatrix.bench.report.page import table
-from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.trainer.evaluation.intervals import bootstrap, paired_difference
 from embomatrix.trainer.lifecycle.stopwatch import Activity
 from embomatrix.world.whole_file import write_whole
 
@@ -50,6 +50,7 @@ def learning_section(
                 [row for arm in arms for row in _success_rows(arm)],
             ),
             "",
+            *_differences(arms),
             f"Training curves: each run is divided into {BINS} equal parts in order of time, and each column is the mean of",
             "one part.",
             "",
@@ -97,7 +98,7 @@ def _success_rows(arm: ArmFindings) -> Iterable[tuple[str, ...]]:
     for run in arm.runs:
         outcome = run.outcome
         then, now = by_task(outcome.before), by_task(outcome.after)
-        gain = bootstrap([now[task] - then[task] for task in now if task in then])
+        gain = paired_difference(then, now)
         yield (
             arm.name,
             str(run.seed),
@@ -116,6 +117,19 @@ def _success_rows(arm: ArmFindings) -> Iterable[tuple[str, ...]]:
             arm.after.as_percent(),
             arm.gain.as_percent(),
         )
+
+
+def _differences(arms: Sequence[ArmFindings]) -> list[str]:
+    """Table of the other arms' differences to the first one; nothing for a single arm."""
+    if len(arms) < 2:
+        return []
+    first, *others = arms
+    return [
+        f"Success after GRPO minus that of the arm *{first.name}*, paired by seed and task.",
+        "",
+        *table(("arm", "difference"), [(arm.name, difference(first, arm).as_percent()) for arm in others]),
+        "",
+    ]
 
 
 def _curve_rows(run: Run) -> Iterable[tuple[str, ...]]:

@@ -46,15 +46,19 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
 
 
 def paired_difference(before: Mapping[str, float], after: Mapping[str, float]) -> Interval:
-    """Mean of after minus before over the tasks in both, with a bootstrap over tasks. NaN rates are left out.
+    """Mean of after minus before over the tasks in both. NaN rates are left out."""
+    return mean_difference([rate - before[task] for task, rate in after.items() if task in before])
+
+
+def mean_difference(differences: Sequence[float]) -> Interval:
+    """Mean of the tasks' differences in [-1, 1], with a bootstrap over tasks; NaN is left out.
 
     If all n differences are equal, the bootstrap would be falsely certain. A share of up to 1 - 0.025 ** (1/n) of all tasks may
-    then have another difference (Clopper and Pearson 1934, none of n), which lies in [-1, 1].
+    then have another difference (Clopper and Pearson 1934, none of n).
     """
-    differences = [rate - before[task] for task, rate in after.items() if task in before]
     known = [value for value in differences if value == value]
     if not known or min(known) < max(known):
-        return bootstrap(differences)
+        return bootstrap(known)
     share, value = 1 - ((1 - LEVEL) / 2) ** (1 / len(known)), known[0]
     return Interval(value, value - share * (1 + value), value + share * (1 - value))
 
