@@ -37,5 +37,5 @@ def play_by_policy(
         reward = observation.reward
         if observation.end is not None:
             break
-        rows.tell([0], [observation.text])
+        rows.observe([0], [observation.text])
     return reward

@@ -62,7 +62,7 @@ def play(made, asked, group, seed, longest=5, turns=5):
         told = [draw.choice(TOLD) for _ in going]
         for row, text in zip(going, told, strict=True):
             heard.setdefault(row, []).append(text)
-        rows.tell(going, told)
+        rows.observe(going, told)
     return rows.samples(), heard
 
 
@@ -107,7 +107,7 @@ def test_rows_are_answers_and_what_was_told_between_them():
         assert len(told) == len(answers) - 1 <= len(texts)
         for answer, after, text in zip(answers, told, texts, strict=False):
             ending = [] if answer[-1] in ends else [made.end_tokens[0]]
-            assert after == [*ending, *made.encode_told(text)]
+            assert after == [*ending, *made.encode_observation(text)]
             assert len(answer) <= 5
             assert not ends & set(answer[:-1])
 
@@ -130,7 +130,7 @@ def test_episode_ends_where_the_context_has_no_room_for_another_answer():
         if answers == [None, None]:
             break
         going = [row for row, answer in enumerate(answers) if answer is not None]
-        rows.tell(going, ["did it and more"] * len(going))
+        rows.observe(going, ["did it and more"] * len(going))
         if len(going) < 2:
             break
     samples = rows.samples()
@@ -161,18 +161,18 @@ def test_tokens_between_two_answers_follow_the_template(template, end, between):
     assert set(made.answer_ends) == {known, *made.end_tokens}
     assert made.encode_answer("move 1")[-1] == known
     whole = made._tokens(between)
-    assert made.encode_told("did it") == (whole[1:] if between.startswith(end) else whole)
+    assert made.encode_observation("did it") == (whole[1:] if between.startswith(end) else whole)
 
 
 def test_without_a_template_an_answer_follows_its_name():
-    assert POLICY.encode_told("did it") == POLICY._tokens("\ndid it\nAnswer:\n")
+    assert POLICY.encode_observation("did it") == POLICY._tokens("\ndid it\nAnswer:\n")
     assert POLICY.answer_end == POLICY.end_tokens[0]
 
 
 def test_template_that_leaves_answers_out_is_refused():
     forgetful = "{% for each in messages if each.role == 'user' %}{{ each.content }}{% endfor %}"
     with pytest.raises(TrainerError, match="leaves earlier answers out"):
-        policy(forgetful).encode_told("did it")
+        policy(forgetful).encode_observation("did it")
 
 
 def small(config, **changes):
@@ -210,7 +210,7 @@ def test_imitation_of_an_episode_counts_the_answers_of_the_oracle_alone():
     assert whole.imitated == sum(map(len, answers))
     assert taught.imitated == whole.imitated - len(answers[0])
     assert whole.plan[-len(answers[2]) :] == answers[2]
-    mask = torch.tensor([[not told for told in whole.told]])
+    mask = torch.tensor([[not told for told in whole.observed]])
     scored = made.logprobs([whole.prompt], torch.tensor([whole.plan]), mask, 1, 1.0).logprobs
     assert negative_log_likelihood(made, [whole]).item() == pytest.approx(-scored.sum().item(), rel=1e-4)
 

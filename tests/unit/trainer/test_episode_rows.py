@@ -70,7 +70,7 @@ def played(made, tasks, group, choices, *, turns=4, seed=0):
         rows = sorted(told)
         if not rows:
             break
-        episodes.tell(rows, [TOLD[told[row]] for row in rows])
+        episodes.observe(rows, [TOLD[told[row]] for row in rows])
     return asked, episodes.samples(), answers
 
 
@@ -98,7 +98,7 @@ def test_rows_hold_the_answers_and_what_was_told_between_them(choices):
             expected += words
             own += [True] * len(words)
             if turn + 1 < len(answers[row]):
-                told = POLICY.encode_told(TOLD[choices[(row, turn)]])
+                told = POLICY.encode_observation(TOLD[choices[(row, turn)]])
                 expected += told
                 own += [False] * len(told)
         length = len(expected)
@@ -123,7 +123,7 @@ def test_episodes_may_be_lost_before_the_first_answer():
     episodes = EpisodeRows(POLICY, asked, 2, 1.3, generator)
     for _ in range(3):
         episodes.answer([1, 2, 3])
-        episodes.tell([1, 2, 3], [TOLD[1]] * 3)
+        episodes.observe([1, 2, 3], [TOLD[1]] * 3)
     samples = episodes.samples()
     assert not samples.mask[0].any()
     scored = POLICY.logprobs(asked, samples.tokens, samples.mask, 2, 1.3)
@@ -154,10 +154,10 @@ def test_a_thing_can_be_named_once_the_policy_was_told_of_it():
         return not POLICY.grammar.token_mask(state, names)[0, number]
 
     assert not may_follow()
-    told = torch.tensor([POLICY.encode_told(f"did\n{THING} in {ROOM}")])
-    POLICY.grammar.tell(names, told, torch.zeros_like(told, dtype=torch.bool))
+    told = torch.tensor([POLICY.encode_observation(f"did\n{THING} in {ROOM}")])
+    POLICY.grammar.observe(names, told, torch.zeros_like(told, dtype=torch.bool))
     assert not may_follow()
-    POLICY.grammar.tell(names, told, torch.ones_like(told, dtype=torch.bool))
+    POLICY.grammar.observe(names, told, torch.ones_like(told, dtype=torch.bool))
     assert may_follow()
 
 
@@ -179,7 +179,7 @@ def test_an_episode_ends_where_the_context_has_no_room_for_another_answer():
         if answers == [None, None]:
             break
         rows = [row for row, answer in enumerate(answers) if answer is not None]
-        episodes.tell(rows, [TOLD[2]] * len(rows))
+        episodes.observe(rows, [TOLD[2]] * len(rows))
         if len(rows) < 2:
             break
     samples = episodes.samples()
@@ -192,7 +192,7 @@ def test_an_episode_ends_where_the_context_has_no_room_for_another_answer():
 
 def test_what_the_policy_is_told_is_not_imitated():
     prompt = prompts(POLICY, 1)[0]
-    call, told = POLICY.encode_plan(f"go_to_room {ROOM}"), POLICY.encode_told(TOLD[0])
+    call, told = POLICY.encode_plan(f"go_to_room {ROOM}"), POLICY.encode_observation(TOLD[0])
     plan = (*call, *told, END)
     marks = (False,) * len(call) + (True,) * len(told) + (False,)
     example = ImitationExample(prompt, plan, marks)
@@ -207,7 +207,7 @@ def test_what_the_policy_is_told_is_not_imitated():
 
 def test_what_the_policy_began_is_not_imitated_and_counts_as_its_own():
     prompt = prompts(POLICY, 1)[0]
-    call, told = POLICY.encode_plan(f"go_to_room {ROOM}"), POLICY.encode_told(TOLD[0])
+    call, told = POLICY.encode_plan(f"go_to_room {ROOM}"), POLICY.encode_observation(TOLD[0])
     plan = (*call, *told, *call, *told, END)
     marks = ((False,) * len(call) + (True,) * len(told)) * 2 + (False,)
     begun = len(call) + len(told)

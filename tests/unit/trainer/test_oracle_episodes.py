@@ -39,8 +39,8 @@ class SolvedEpisode:
 
 
 def test_success_of_the_policy_alone_teaches_nothing():
-    assert successful(SolvedEpisode(), begun=1).begun == 1
-    assert successful(SolvedEpisode(), begun=2) is None
+    assert successful(SolvedEpisode(), policy_answers=1).policy_answers == 1
+    assert successful(SolvedEpisode(), policy_answers=2) is None
 
 
 class Client:

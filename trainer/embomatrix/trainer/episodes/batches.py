@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
 T = TypeVar("T")
-_NOTHING = Prompt("", "task")
+_EMPTY_PROMPT = Prompt("", "task")
 """Prompt of a task whose episodes were all lost before they began."""
-_AT_ONCE = 2
+_CONCURRENT_BATCHES = 2
 """Batches that a learner plays at a time: one is sampled while the cluster executes the other's calls. Each has a cache."""
-_LOOK_S = 0.5
-"""Seconds between two looks whether the trainer has ended, while its process waits for the cluster."""
+_POLL_S = 0.5
+"""Seconds between two checks whether the trainer has ended, while its process waits for the cluster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ def play_batches(
 
     def play(own: Sequence[EpisodeBatch], learner: Learner | RemoteLearner) -> list[PlayedBatch]:
         coming = (_RunningBatch(batch, learner, client, policy, rule) for batch in own)
-        waiting = deque(itertools.islice(coming, _AT_ONCE))
+        waiting = deque(itertools.islice(coming, _CONCURRENT_BATCHES))
         done = []
         while waiting:
             first = waiting.popleft()
@@ -122,22 +122,22 @@ class _RunningBatch:
         self._episodes: list[ClusterEpisode] = []
         self._prompts: tuple[Tokens, ...] = ()
         self._answered: list[int] = []
-        self._told: Future[list[str]] | None = None
+        self._observations: Future[list[str]] | None = None
         self._waited_s = 0.0
 
     def advance(self) -> bool:
         """Wait for what happened, and answer. Return False once the policy answers in no episode any more."""
         if self._beginning is not None:
             self._begin(self._beginning)
-            rows, told = [*range(len(self._episodes))], None
+            rows, observations = [*range(len(self._episodes))], None
         else:
-            assert self._told is not None
-            rows, told = self._answered, self._wait(self._told)
+            assert self._observations is not None
+            rows, observations = self._answered, self._wait(self._observations)
         going = [place for place, row in enumerate(rows) if self._episodes[row].is_for_policy]
         playing = [rows[place] for place in going]
         if not playing:
             return False
-        texts = [] if told is None else [told[place] for place in going]
+        texts = [] if observations is None else [observations[place] for place in going]
         self._answer(playing, self._learner.answer_episodes(self._batch.index, playing, texts))
         return bool(self._answered)
 
@@ -145,7 +145,7 @@ class _RunningBatch:
         self._episodes, self._beginning = self._wait(beginning), None
         group = self._rule.group
         openings = [
-            next((each.opening for each in self._episodes[at : at + group] if each.opening), _NOTHING)
+            next((each.opening for each in self._episodes[at : at + group] if each.opening), _EMPTY_PROMPT)
             for at in range(0, len(self._episodes), group)
         ]
         self._prompts = tuple(self._policy.encode(opening) for opening in openings)
@@ -164,13 +164,13 @@ class _RunningBatch:
         ]
         self._answered = [row for row, _ in given]
         episodes = [self._episodes[row] for row in self._answered]
-        self._told = self._client.answer(episodes, [answer for _, answer in given])
+        self._observations = self._client.answer(episodes, [answer for _, answer in given])
 
     def _wait(self, future: Future[T]) -> T:
         """Wait for the cluster. The thread of a remote learner gives up once that is closed, or Ctrl-C would wait too."""
         began_s = time.monotonic()
         try:
-            while not concurrent.futures.wait([future], timeout=_LOOK_S).done:
+            while not concurrent.futures.wait([future], timeout=_POLL_S).done:
                 if isinstance(self._learner, RemoteLearner) and self._learner.closed:
                     raise TrainerError("the trainer has ended")
             return result_of(future)

@@ -46,11 +46,11 @@ class ClusterEpisode:
         self.opening: Prompt | None = None
         self.answers: list[str] = []
         """Answers so far."""
-        self.told: list[str] = []
-        """Texts that were told after the answers."""
+        self.observations: list[str] = []
+        """Texts that followed the answers."""
         self.states: list[Hashable] = []
         """State before each answer."""
-        self.begun = 0
+        self.policy_answers = 0
         """Answers of the policy before another took over."""
         self.lost: InfraFailure | None = None
         self._handover = handover
@@ -83,12 +83,12 @@ class ClusterEpisode:
         self.opening = await self._try(self.player.begin)
 
     async def answer(self, text: str) -> str:
-        """Take an answer and return what the policy is told. Raises ClusterError if the manager can't be reached."""
+        """Take an answer and return the observation. Raises ClusterError if the manager can't be reached."""
         self.answers.append(text)
         self.states.append(self.player.state)
         observation = await self._try(lambda: self.player.answer(text))
-        self.told.append("" if observation is None else observation.text)
-        return self.told[-1]
+        self.observations.append("" if observation is None else observation.text)
+        return self.observations[-1]
 
     async def advise(self) -> Advice | None:
         """Ask the oracle what it would do from here on; None if the infrastructure lost the episode. Raises ClusterError."""
@@ -144,7 +144,7 @@ class EpisodeClient:
         return episodes
 
     def answer(self, episodes: Sequence[ClusterEpisode], texts: Sequence[str]) -> Future[list[str]]:
-        """Give each episode an answer. The future has what the policy is told after each, and fails as that of ``begin``."""
+        """Give each episode an answer. The future has the observation after each, and fails as that of ``begin``."""
         return self._gateway.run(
             _all(episode.answer(text) for episode, text in zip(episodes, texts, strict=True))
         )

@@ -38,7 +38,7 @@ _FILE_VERSION: Final[Mapping[str, object]] = {"format": FORMAT, "file": 3}
 Files of version 1 did not say who gave an answer, and neither they nor those of version 2 had system texts.
 """
 _REPORT_S: Final = 0.5
-_SCENES: Final = 4
+_CONCURRENT_SCENES: Final = 4
 """Scenes whose episodes are played at a time: with more, workers would load them again and again."""
 ATTEMPTS: Final = 2
 """Times that an episode is played at most, if the infrastructure loses it."""
@@ -46,28 +46,28 @@ ATTEMPTS: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class OracleEpisode:
-    """Successful episode of a task: its opening, and the answers, each with what was told then.
+    """Successful episode of a task: its opening, and the answers, each with the observation that followed.
 
-    The policy gave the first ``begun`` answers, the oracle all others.
+    The policy gave the first ``policy_answers`` answers, the oracle all others.
     """
 
     opening: Prompt
     turns: tuple[tuple[str, str], ...]
-    begun: int = 0
+    policy_answers: int = 0
 
     def example(self, policy: Policy) -> ImitationExample:
         """Return the episode's tokens. Only the oracle's answers are imitated."""
         tokens: list[int] = []
-        told: list[bool] = []
-        begun = 0
+        observed: list[bool] = []
+        policy_tokens = 0
         for number, (answer, observation) in enumerate(self.turns, start=1):
             own = policy.encode_answer(answer)
-            after = policy.encode_told(observation) if number < len(self.turns) else ()
+            after = policy.encode_observation(observation) if number < len(self.turns) else ()
             tokens += (*own, *after)
-            told += [False] * len(own) + [True] * len(after)
-            if number == self.begun:
-                begun = len(tokens)
-        return ImitationExample(policy.encode(self.opening), tuple(tokens), tuple(told), begun)
+            observed += [False] * len(own) + [True] * len(after)
+            if number == self.policy_answers:
+                policy_tokens = len(tokens)
+        return ImitationExample(policy.encode(self.opening), tuple(tokens), tuple(observed), policy_tokens)
 
 
 class OracleExamples:
@@ -165,7 +165,7 @@ async def _play_all(planned: Sequence[PlannedEpisode], client: EpisodeClient, pr
     by_scene: dict[str, list[PlannedEpisode]] = {}
     for each in planned:
         by_scene.setdefault(each.task.bundle_digest, []).append(each)
-    gate = asyncio.Semaphore(_SCENES)
+    gate = asyncio.Semaphore(_CONCURRENT_SCENES)
 
     async def play_scene(own: Sequence[PlannedEpisode]) -> None:
         async with gate:
@@ -206,14 +206,16 @@ async def finish(episode: ClusterEpisode, script: SearchingScript) -> None:
         await episode.answer(answer_text(call, known, episode.player.codec))
 
 
-def successful(episode: ClusterEpisode, begun: int = 0) -> OracleEpisode | None:
+def successful(episode: ClusterEpisode, policy_answers: int = 0) -> OracleEpisode | None:
     """Return an episode that is over as one to imitate; None if it failed, was lost, or has no answer of the oracle.
 
-    The policy gave the first ``begun`` answers.
+    The policy gave the first ``policy_answers`` answers.
     """
-    if not episode.outcome().success or episode.opening is None or len(episode.answers) == begun:
+    if not episode.outcome().success or episode.opening is None or len(episode.answers) == policy_answers:
         return None
-    return OracleEpisode(episode.opening, tuple(zip(episode.answers, episode.told, strict=True)), begun)
+    return OracleEpisode(
+        episode.opening, tuple(zip(episode.answers, episode.observations, strict=True)), policy_answers
+    )
 
 
 def read_episodes(path: Path, version: Mapping[str, object]) -> dict[str, OracleEpisode] | None:
@@ -228,7 +230,7 @@ def read_episodes(path: Path, version: Mapping[str, object]) -> dict[str, Oracle
         return {
             str(task_id): OracleEpisode(
                 Prompt(systems[system], str(opening)),
-                tuple((str(answer), str(told)) for answer, told in turns),
+                tuple((str(answer), str(observation)) for answer, observation in turns),
                 int(begun),
             )
             for task_id, (system, opening, begun, *turns) in value["episodes"].items()
@@ -243,7 +245,12 @@ def write_episodes(path: Path, version: Mapping[str, object], episodes: Mapping[
     """Keep episodes by task, with what they depend on."""
     systems = [*dict.fromkeys(episode.opening.system for episode in episodes.values())]
     rows = {
-        task_id: [systems.index(episode.opening.system), episode.opening.user, episode.begun, *episode.turns]
+        task_id: [
+            systems.index(episode.opening.system),
+            episode.opening.user,
+            episode.policy_answers,
+            *episode.turns,
+        ]
         for task_id, episode in episodes.items()
     }
     content = {"version": {**version, **_FILE_VERSION}, "systems": systems, "episodes": rows}

@@ -40,11 +40,11 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy
 
 TAUGHT_EPISODES: Final = "taught_episodes_{}.json"
-_TOGETHER: Final = 16
+_BATCH_EPISODES: Final = 16
 """Episodes that a learner samples together."""
-_EACH: Final = 2
+_CONCURRENT_BATCHES: Final = 2
 """Such batches that each learner plays at a time. With more, workers would load the scenes again and again."""
-_STREAM: Final = 6
+_RNG_STREAM: Final = 6
 """Part of the seed of a round's draws, which sets them apart from all others of a run."""
 
 
@@ -131,7 +131,7 @@ class Teacher:
     def _planned(self, number: int, tasks: Sequence[TrainingTask]) -> list[PlannedEpisode]:
         """Draw the tasks of a round, those of a scene side by side, and the answers after which the oracle takes over."""
         rules = self._rules
-        rng = np.random.default_rng(np.random.SeedSequence((rules.seed, _STREAM, number)))
+        rng = np.random.default_rng(np.random.SeedSequence((rules.seed, _RNG_STREAM, number)))
         chosen = rng.choice(len(tasks), size=min(rules.episodes, len(tasks)), replace=False)
         drawn = sorted((tasks[int(at)] for at in chosen), key=lambda task: task.bundle_digest)
         return [
@@ -147,11 +147,11 @@ class Teacher:
         """Play the episodes of a round. Return those that succeed, by task. Raises TrainerError if all were lost."""
         found: dict[str, OracleEpisode] = {}
         lost = ""
-        size = _EACH * _TOGETHER * self._workers.count
+        size = _CONCURRENT_BATCHES * _BATCH_EPISODES * self._workers.count
         for start in range(0, len(planned), size):
             self._display.teaching(number, start, len(planned))
             for task_id, episode in self._begin_and_finish(number, planned, range(start, start + size)):
-                taught = successful(episode, episode.begun)
+                taught = successful(episode, episode.policy_answers)
                 if taught is not None:
                     found[task_id] = taught
                 elif episode.lost is not None:
@@ -164,11 +164,11 @@ class Teacher:
         self, number: int, planned: Sequence[PlannedEpisode], places: range
     ) -> list[tuple[str, ClusterEpisode]]:
         """Let the policy begin the episodes at these places, and the oracle finish them. Return them with their tasks."""
-        starts = places[::_TOGETHER]
+        starts = places[::_BATCH_EPISODES]
         batches = [
             EpisodeBatch(index, part, _batch_seed(self._rules.seed, number, start))
             for index, start in enumerate(starts)
-            if (part := planned[start : start + _TOGETHER])
+            if (part := planned[start : start + _BATCH_EPISODES])
         ]
         played = play_batches(batches, self._workers, self._client, self._policy, self._rules.sampling)
         begun = [
@@ -202,7 +202,7 @@ class Teacher:
         return episode
 
     async def _finish_once(self, task: TrainingTask, episode: ClusterEpisode) -> None:
-        episode.begun = len(episode.answers)
+        episode.policy_answers = len(episode.answers)
         if episode.is_over:
             return
         advice = await episode.advise()
@@ -215,4 +215,4 @@ class Teacher:
 
 def _batch_seed(seed: int, number: int, at: int) -> int:
     """Seed of what the policy samples in a part of a round."""
-    return int(np.random.SeedSequence((seed, _STREAM, number, at)).generate_state(1)[0])
+    return int(np.random.SeedSequence((seed, _RNG_STREAM, number, at)).generate_state(1)[0])

@@ -29,13 +29,13 @@ class ConversingSubject:
         self._episode: EpisodeRows | ChatRows | None = None
 
     async def answer(
-        self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
+        self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
     ) -> Said:
         """Return the next call, or that the task is done."""
         if self._episode is None:
-            self._episode = self._begun(Prompt(system, told[-1]))
+            self._episode = self._begun(Prompt(system, observations[-1]))
         else:
-            self._episode.tell([0], [told[-1]])
+            self._episode.observe([0], [observations[-1]])
         answer = self._episode.answer([0])[0]
         if answer is None:
             player.stop()

@@ -63,12 +63,12 @@ class EpisodeSubject(Protocol):
     """Anything that plays one episode."""
 
     async def answer(
-        self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
+        self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
     ) -> Said:
         """Return the next answer.
 
-        ``told`` are the texts so far, the task first, and ``said`` the answers to them. A model must not look at the player,
-        but stops it if it has no room for another answer; then what it returns does not count.
+        ``observations`` are the texts so far, the task first, and ``answers`` the answers to them. A model must not look at the
+        player, but stops it if it has no room for another answer; then what it returns does not count.
         """
         ...
 
@@ -159,17 +159,17 @@ def play_episodes(
 
     async def play(task_id: str, sample: int, prompt: Prompt, player: EpisodePlayer) -> None:
         subject = subject_of(task_id, sample)
-        said: list[Said] = []
-        told = [prompt.user]
+        answers: list[Said] = []
+        observations = [prompt.user]
         while player.end is None:
-            answer = await subject.answer(prompt.system, told, [one.text for one in said], player)
+            answer = await subject.answer(prompt.system, observations, [one.text for one in answers], player)
             if player.end is not None:  # the subject has no room for another answer
                 break
-            said.append(answer)
-            told.append((await player.answer(said[-1].text)).text)
-        text = json.dumps([one.text for one in said])
-        tokens = (sum(one.prompt_tokens for one in said), sum(one.completion_tokens for one in said))
-        finish = said[-1].finish if said else ""
+            answers.append(answer)
+            observations.append((await player.answer(answers[-1].text)).text)
+        text = json.dumps([one.text for one in answers])
+        tokens = (sum(one.prompt_tokens for one in answers), sum(one.completion_tokens for one in answers))
+        finish = answers[-1].finish if answers else ""
         sheet.add([Answer(task_id, sample, text, finish, *tokens)])
         on_progress(len(sheet), total)
 
@@ -192,13 +192,13 @@ class ChatSubject:
         self._seed = seed_of(setup.seed, task_id, sample)
 
     async def answer(
-        self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
+        self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
     ) -> Said:
         """Ask the model. Raises LlmError."""
         turns = itertools.chain.from_iterable(
             itertools.zip_longest(
-                (Message(Speaker.USER, text) for text in told),
-                (Message(Speaker.ASSISTANT, text) for text in said),
+                (Message(Speaker.USER, text) for text in observations),
+                (Message(Speaker.ASSISTANT, text) for text in answers),
             )
         )
         messages = [Message(Speaker.SYSTEM, system), *filter(None, turns)]
@@ -260,7 +260,7 @@ class SearchingSubject:
         self._script = SearchingScript.of(task.oracle, task.situation, priors)
 
     async def answer(
-        self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
+        self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
     ) -> Said:
         """Return the script's next call."""
         last = player.steps[-1] if player.steps else None
@@ -274,7 +274,7 @@ class PlanSubject:
         self._calls = iter(plan)
 
     async def answer(
-        self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
+        self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
     ) -> Said:
         """Return the plan's next call."""
         return _said(next(self._calls, None))

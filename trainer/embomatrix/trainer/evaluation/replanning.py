@@ -52,7 +52,7 @@ class ReplanningSubject:
         self._plans = 0
 
     async def answer(
-        self, system: str, told: Sequence[str], said: Sequence[str], player: EpisodePlayer
+        self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
     ) -> Said:
         """Return the next call of the plan, or of a new one."""
         situation = player.observer.situation

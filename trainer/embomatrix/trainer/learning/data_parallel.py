@@ -98,8 +98,10 @@ class RemoteLearner:
     def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
         self._request("begin_episodes", number, tuple(prompts), seed, rule)
 
-    def answer_episodes(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
-        answers: list[str | None] = self._request("answer_episodes", number, tuple(rows), tuple(told))
+    def answer_episodes(
+        self, number: int, rows: Sequence[int], observations: Sequence[str]
+    ) -> list[str | None]:
+        answers: list[str | None] = self._request("answer_episodes", number, tuple(rows), tuple(observations))
         return answers
 
     def end_episodes(self, number: int) -> Samples:

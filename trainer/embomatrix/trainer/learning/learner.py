@@ -72,14 +72,16 @@ class Learner:
             self.policy, prompts, rule.group, rule.temperature, seed, rule.max_new
         )
 
-    def answer_episodes(self, number: int, rows: Sequence[int], told: Sequence[str]) -> list[str | None]:
+    def answer_episodes(
+        self, number: int, rows: Sequence[int], observations: Sequence[str]
+    ) -> list[str | None]:
         """Tell episodes of a batch what happened, unless they begin, and sample their answers.
 
         An answer is None if the policy has no room for another one.
         """
         episodes = self._episodes[number]
-        if told:
-            episodes.tell(rows, told)
+        if observations:
+            episodes.observe(rows, observations)
         return episodes.answer(rows)
 
     def end_episodes(self, number: int) -> Samples:

@@ -18,8 +18,8 @@ def negative_log_likelihood(policy: Policy, examples: Sequence[ImitationExample]
     """Return the negative log-likelihood of the plans in nats, summed over the tokens that are imitated."""
     tokens = pad_sequence([torch.tensor(example.plan) for example in examples], batch_first=True)
     mask = pad_sequence([_own(example) for example in examples], batch_first=True)
-    begun = torch.tensor([example.begun for example in examples])
-    imitated = torch.arange(tokens.shape[1]) >= begun[:, None]
+    first = torch.tensor([example.policy_tokens for example in examples])
+    imitated = torch.arange(tokens.shape[1]) >= first[:, None]
     device = next(iter(policy.parameters())).device
     prompts = [example.prompt for example in examples]
     scored = policy.logprobs(prompts, tokens.to(device), mask.to(device), group=1, temperature=1.0)
@@ -27,4 +27,4 @@ def negative_log_likelihood(policy: Policy, examples: Sequence[ImitationExample]
 
 
 def _own(example: ImitationExample) -> Tensor:
-    return ~torch.tensor(example.told or (False,) * len(example.plan), dtype=torch.bool)
+    return ~torch.tensor(example.observed or (False,) * len(example.plan), dtype=torch.bool)

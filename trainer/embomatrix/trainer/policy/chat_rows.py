@@ -1,4 +1,4 @@
-"""Episodes that a language model plays side by side, as rows of tokens: its answers, and what it is told between them.
+"""Episodes that a language model plays side by side, as rows of tokens: its answers, and the observations between them.
 
 Tokens are appended and never encoded again. The key-value cache stays from turn to turn; where a row has fewer new tokens than
 others, the cache has a gap that nothing attends to.
@@ -117,14 +117,14 @@ class ChatRows:
         self._lengths = self._lengths + count
 
     @torch.no_grad()
-    def tell(self, rows: Sequence[int], texts: Sequence[str]) -> None:
-        """Append what the policy is told after its answer to each of these rows."""
+    def observe(self, rows: Sequence[int], texts: Sequence[str]) -> None:
+        """Append the observation that follows its answer to each of these rows."""
         self._keep_only(set(rows))
-        told = dict(zip(rows, texts, strict=True))
+        observations = dict(zip(rows, texts, strict=True))
         encoded = []
         for row in self._playing.tolist():
             ending = (self._policy.answer_end,) if self._rows[row].is_open else ()
-            words = (*ending, *self._policy.encode_told(told[row]))[: max(0, self._room(row))]
+            words = (*ending, *self._policy.encode_observation(observations[row]))[: max(0, self._room(row))]
             self._rows[row].add(words, None)
             encoded.append(torch.tensor(words, dtype=torch.long))
         if not any(map(len, encoded)):

@@ -288,7 +288,7 @@ class Decoder(nn.Module):
             logits = torch.cat([logits, query @ plan.pointer_keys.transpose(1, 2)], dim=2)
             own = shortlist.columns[plan.tokens]  # (Q G, S)
             columns = torch.cat([columns, own[:, None].expand(rows, length, count)], dim=2)
-            # What the policy is told in an episode may have words that plans can't contain.
+            # Observations may have words that plans can't contain.
             nowhere = own < 0 if plan.gaps is None else plan.gaps | (own < 0)
             absent = torch.cat([absent, future | nowhere[:, None]], dim=2)
         columns = columns.clamp(min=0)

@@ -1,4 +1,4 @@
-"""Episodes that the word-level policy plays side by side: answers are sampled, and what it is told is appended.
+"""Episodes that the word-level policy plays side by side: answers are sampled, observations appended.
 
 Tokens are appended and never encoded again, so those that are trained on are those that were sampled. Each episode is one row
 of tokens behind its prompt, as a plan is.
@@ -39,7 +39,7 @@ class EpisodeRow:
     """True if the last answer was cut off before its end."""
 
     def add(self, tokens: Sequence[int], logprobs: Sequence[float] | None) -> None:
-        """Append tokens. Those that the policy was told have no log-probabilities."""
+        """Append tokens. Those of observations have no log-probabilities."""
         self.tokens += tokens
         self.own += [logprobs is not None] * len(tokens)
         self.logprobs += [0.0] * len(tokens) if logprobs is None else logprobs
@@ -144,11 +144,13 @@ class EpisodeRows:
         return [self._rows[row].answers[-1] for row in rows]
 
     @torch.no_grad()
-    def tell(self, rows: Sequence[int], texts: Sequence[str]) -> None:
-        """Append what the policy is told after its answer to each of these rows."""
-        policy, told = self._policy, dict(zip(rows, texts, strict=True))
+    def observe(self, rows: Sequence[int], texts: Sequence[str]) -> None:
+        """Append the observation that follows its answer to each of these rows."""
+        policy, observations = self._policy, dict(zip(rows, texts, strict=True))
         encoded = [
-            policy.encode_told(told[row])[: max(0, self._room(row))] if row in told else ()
+            policy.encode_observation(observations[row])[: max(0, self._room(row))]
+            if row in observations
+            else ()
             for row in self._playing.tolist()
         ]
         if not any(encoded):
@@ -159,8 +161,10 @@ class EpisodeRows:
         lengths = torch.tensor([len(words) for words in encoded])
         gaps = torch.arange(tokens.shape[1]) >= lengths[:, None]
         tokens, gaps = tokens.to(policy.device), gaps.to(policy.device)
-        policy.grammar.tell(self._names, tokens, ~gaps)
-        self._grammar_state = policy.grammar.after_telling(self._grammar_state, lengths.to(policy.device) > 0)
+        policy.grammar.observe(self._names, tokens, ~gaps)
+        self._grammar_state = policy.grammar.after_observation(
+            self._grammar_state, lengths.to(policy.device) > 0
+        )
         with frozen_weights(policy.module):
             self._extend(tokens, gaps)
         self._plan = self._plan.closed() if self._plan else None

@@ -3,7 +3,7 @@
 ``PlanGrammar`` belongs to a vocabulary, ``PromptNames`` to a batch of prompts. Both are lookup tables, so the masks of
 all rows are computed at once.
 
-In an episode each answer is one call, and what the policy is told after it may name further things.
+In an episode each answer is one call, and the observation after it may name further things.
 
 Shapes: Q prompts of P tokens, R rows (plans), T tokens of a plan, V words, N number words (``_0`` ``_1`` ...).
 """
@@ -204,23 +204,23 @@ class PlanGrammar:
         allowed[:, END] |= ~allowed.any(dim=1)
         return ~allowed
 
-    def after_telling(self, state: GrammarState, told: Tensor) -> GrammarState:
-        """State of plans that go on after the policy was told something: the next answer begins. told (R,) marks them."""
+    def after_observation(self, state: GrammarState, observed: Tensor) -> GrammarState:
+        """State of plans that go on after an observation: the next answer begins. ``observed`` (R,) marks them."""
         return GrammarState(
-            state.skill.masked_fill(told, PAD),
-            state.arguments.masked_fill(told, 0),
-            state.open_stem.masked_fill(told, PAD),
+            state.skill.masked_fill(observed, PAD),
+            state.arguments.masked_fill(observed, 0),
+            state.open_stem.masked_fill(observed, PAD),
             state.taken,
         )
 
-    def tell(self, names: PromptNames, tokens: Tensor, told: Tensor) -> None:
-        """Add the numbered names in tokens (R, T) of which ``told`` (R, T) were not written by the policy, in place."""
-        for at, rows, kind in self._told_names(tokens, told):
+    def observe(self, names: PromptNames, tokens: Tensor, observed: Tensor) -> None:
+        """Add the numbered names in tokens (R, T) of which ``observed`` (R, T) were not written by the policy, in place."""
+        for at, rows, kind in self._observed_names(tokens, observed):
             names.add(kind, rows, tokens[rows, at - 1], self._number_index[tokens[rows, at]])
 
-    def _told_names(self, tokens: Tensor, told: Tensor) -> Iterator[tuple[int, Tensor, int]]:
+    def _observed_names(self, tokens: Tensor, observed: Tensor) -> Iterator[tuple[int, Tensor, int]]:
         """Yield the rows in which a name ends at a position, with that position and the kind of the name, in order."""
-        joined = told[:, 1:] & told[:, :-1] & (self._number_index[tokens[:, 1:]] >= 0)  # (R, T - 1)
+        joined = observed[:, 1:] & observed[:, :-1] & (self._number_index[tokens[:, 1:]] >= 0)  # (R, T - 1)
         ends = self._stems[:, tokens[:, :-1]] & joined  # (2, R, T - 1)
         for before in ends.any(dim=1).any(dim=0).nonzero()[:, 0].tolist():
             for kind in range(2):
@@ -234,17 +234,20 @@ class PlanGrammar:
         names: PromptNames,
         shortlist: Shortlist,
         places: Tensor,
-        told: Tensor | None = None,
+        observed: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return which words of a shortlist are masked at places (R, M) of plans (R, T), and their coverage: (R, M, K) each.
 
-        The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood. ``told`` (R, T) marks
-        tokens that the policy did not write. ``names`` belong to each row's prompt.
+        The plans' own tokens are never masked, so a plan that breaks the grammar still has a likelihood. ``observed`` (R, T)
+        marks tokens that the policy did not write. ``names`` belong to each row's prompt.
         """
-        arguments, open_stems, taken = self._walk(tokens, names, told)
+        arguments, open_stems, taken = self._walk(tokens, names, observed)
         argument, open_stem = arguments.gather(1, places), open_stems.gather(1, places)  # (R, M)
         known = _KnownNames.of(
-            names, [] if told is None else self._told_names(tokens, told), tokens, self._number_index
+            names,
+            [] if observed is None else self._observed_names(tokens, observed),
+            tokens,
+            self._number_index,
         )
         allowed = self._fixed[argument][..., shortlist.words]  # (R, M, K)
         for kind, expected in enumerate((_Expects.OBJECT, _Expects.ROOM)):
@@ -263,7 +266,9 @@ class PlanGrammar:
         expects_object = argument == _Expects.OBJECT
         return masks, self._coverages(taken, known, shortlist, places, open_stem, expects_object)
 
-    def _walk(self, tokens: Tensor, names: PromptNames, told: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _walk(
+        self, tokens: Tensor, names: PromptNames, observed: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return what each position of plans expects and its open stem, (R, T) each, and the words taken, (R, T, 2)."""
         state = self.start(len(tokens))
         arguments, open_stems = [], []
@@ -271,9 +276,9 @@ class PlanGrammar:
             arguments.append(self._arguments[state.skill, state.arguments])
             open_stems.append(state.open_stem)
             state = self.advance(state, tokens[:, at], names)
-            if told is not None:
-                state = self.after_telling(state, told[:, at])
-        taken = state.taken if told is None else state.taken.masked_fill(told[..., None], PAD)
+            if observed is not None:
+                state = self.after_observation(state, observed[:, at])
+        taken = state.taken if observed is None else state.taken.masked_fill(observed[..., None], PAD)
         return torch.stack(arguments, dim=1), torch.stack(open_stems, dim=1), taken
 
     def _coverages(
@@ -303,7 +308,7 @@ class PlanGrammar:
 
 @dataclass(frozen=True, slots=True)
 class _KnownNames:
-    """Names at each position of plans: those of the prompt, and those that the policy was told of before.
+    """Names at each position of plans: those of the prompt, and those that observations named before.
 
     ``number_since`` (R, V, N) and ``stem_since`` (R, 2, V) are the positions after which names are known, -1 for those of the
     prompt; None if there are no others.
@@ -315,10 +320,10 @@ class _KnownNames:
 
     @staticmethod
     def of(
-        names: PromptNames, told: Iterable[tuple[int, Tensor, int]], tokens: Tensor, number_index: Tensor
+        names: PromptNames, observed: Iterable[tuple[int, Tensor, int]], tokens: Tensor, number_index: Tensor
     ) -> _KnownNames:
-        """Collect the names that rows were told of. ``told`` has positions of the last words of names, rows and kinds."""
-        found = [*told]
+        """Collect the names in observations. ``observed`` has positions of the last words of names, rows and kinds."""
+        found = [*observed]
         if not found:
             return _KnownNames(names, None, None)
         never = tokens.shape[1] + 1

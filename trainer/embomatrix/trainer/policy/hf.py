@@ -179,7 +179,7 @@ class HfPolicy:
         """Return the tokens of an answer in an episode, with its end token."""
         return (*self._tokens(text), self.answer_end)
 
-    def encode_told(self, text: str) -> Tokens:
+    def encode_observation(self, text: str) -> Tokens:
         """Return the tokens after the end of an answer: the rest of its turn, the user's turn, and the start of the next.
 
         Raises TrainerError for a chat template that leaves earlier answers out.

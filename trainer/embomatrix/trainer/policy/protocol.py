@@ -17,20 +17,21 @@ Tokens = tuple[int, ...]
 
 
 class ImitationExample(NamedTuple):
-    """Prompt and plan to imitate. ``told`` is true on tokens of the plan that the policy is told in an episode; empty: none.
+    """Prompt and plan to imitate, or prompt and the rest of an episode.
 
-    The first ``begun`` tokens were written by the policy itself and are not imitated.
+    ``observed`` is true on tokens of observations, which have no loss; empty: there are none. The first ``policy_tokens``
+    tokens come from answers of the policy itself and are not imitated either.
     """
 
     prompt: Tokens
     plan: Tokens
-    told: tuple[bool, ...] = ()
-    begun: int = 0
+    observed: tuple[bool, ...] = ()
+    policy_tokens: int = 0
 
     @property
     def imitated(self) -> int:
         """Number of tokens that are imitated."""
-        return len(self.plan) - self.begun - sum(self.told[self.begun :])
+        return len(self.plan) - self.policy_tokens - sum(self.observed[self.policy_tokens :])
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ class Samples:
     """``group`` completions per prompt: row q * group + i is sample i of prompt q.
 
     ``tokens``, ``mask`` and ``logprobs`` have shape (rows, longest completion). ``mask`` is true up to and including the
-    end token. In an episode it is true on the tokens of the policy's answers and false on what the policy was told between
+    end token. In an episode it is true on the tokens of the policy's answers and false on the observations between
     them. Log-probabilities are at the sampling temperature. ``cut_off`` (rows,) is true for completions that reached the
     maximum length without an end token.
     """
@@ -90,8 +91,8 @@ class Policy(Protocol):
         """Return the tokens of an answer in an episode with its end token: the target of imitation."""
         ...
 
-    def encode_told(self, text: str) -> Tokens:
-        """Return the tokens of what the policy is told between two answers of an episode."""
+    def encode_observation(self, text: str) -> Tokens:
+        """Return the tokens of an observation between two answers of an episode."""
         ...
 
     def unknown_words(self, text: str) -> frozenset[str]:

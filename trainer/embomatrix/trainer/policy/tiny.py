@@ -146,8 +146,8 @@ class TinyPolicy:
         """Return the tokens of an answer in an episode. The policy says that it is done by an answer without words."""
         return self.encode_plan("" if text == DONE else text)
 
-    def encode_told(self, text: str) -> Tokens:
-        """Return the tokens of what the policy is told in an episode."""
+    def encode_observation(self, text: str) -> Tokens:
+        """Return the tokens of an observation in an episode."""
         return tuple(self.vocabulary.encode(text))
 
     def unknown_words(self, text: str) -> frozenset[str]:
@@ -225,11 +225,11 @@ class TinyPolicy:
         included[tokens] = True  # other sources' plans may break the grammar
         shortlist = Shortlist.of(included)
         lengths = written_lengths(mask)
-        told = ~mask & (torch.arange(tokens.shape[1], device=self.device) < lengths[:, None])  # (rows, T)
-        in_episodes = bool(told.any())
+        observed = ~mask & (torch.arange(tokens.shape[1], device=self.device) < lengths[:, None])  # (rows, T)
+        in_episodes = bool(observed.any())
         places = _own_places(mask) if in_episodes else _all_places(tokens)
         token_masks, coverages = self.grammar.rules_of_plans(
-            tokens, names.select(prompt_of_row), shortlist, places, told if in_episodes else None
+            tokens, names.select(prompt_of_row), shortlist, places, observed if in_episodes else None
         )
         order = torch.argsort(lengths, stable=True)
         scores = []
