@@ -32,7 +32,7 @@ class LostEpisode:
 class SolvedEpisode:
     opening = Prompt("", "Open the fridge.")
     answers = ("open 2", "done")
-    told = ("open 2: opened fridge 2", "")
+    observations = ("open 2: opened fridge 2", "")
 
     def outcome(self):
         return PlanOutcome("", RewardBreakdown(1.0, 0.2, 30.0, (), success=True), None)
