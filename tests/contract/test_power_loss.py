@@ -23,10 +23,10 @@ from embomatrix.manager.store.protocol import (
     BatchResults,
     BatchRow,
     Candidate,
+    Namespace,
+    NamespaceRow,
     ResultRow,
     RunRow,
-    Shelf,
-    ShelfRow,
     StateError,
 )
 from embomatrix.manager.store.redis import RedisStore
@@ -43,14 +43,16 @@ def results(*cursors, size=40):
 
 
 TRANSACTIONS = (
-    lambda store: store.put_rows(Shelf.SWITCHES, [ShelfRow("lease_key", b"k" * 32)]),
-    lambda store: store.put_rows(Shelf.CREDENTIALS, [ShelfRow("t1", b"{}"), ShelfRow("t2", b"{}")]),
+    lambda store: store.put_rows(Namespace.SWITCHES, [NamespaceRow("lease_key", b"k" * 32)]),
+    lambda store: store.put_rows(
+        Namespace.CREDENTIALS, [NamespaceRow("t1", b"{}"), NamespaceRow("t2", b"{}")]
+    ),
     lambda store: store.open_run(RunRow("run-1", "a run", b"terms")),
     lambda store: store.put_batch(BatchRow("run-1", "b1", "d1", b"p" * LONG)),
     lambda store: store.put_workers(["w1", "w2"]),
     lambda store: store.append_results(results(1, 2)),
     lambda store: store.append_results(results(3, size=LONG)),
-    lambda store: store.put_rows(Shelf.WINDOWS, [ShelfRow("run-1", b"window")]),
+    lambda store: store.put_rows(Namespace.WINDOWS, [NamespaceRow("run-1", b"window")]),
     lambda store: store.open_run(RunRow("run-2", "")),
     lambda store: store.put_batch(BatchRow("run-2", "b1", "d2", b"q")),
     lambda store: store.append_results(results(4, 5, 6)),
@@ -59,7 +61,7 @@ TRANSACTIONS = (
     lambda store: store.put_batch(BatchRow("run-1", "b2", "d3", b"s" * LONG)),
     lambda store: store.drop_batch("run-2", "b1"),
     lambda store: store.close_run("run-2"),
-    lambda store: store.put_rows(Shelf.REPUTATIONS, [ShelfRow("w2", b"{}")]),
+    lambda store: store.put_rows(Namespace.REPUTATIONS, [NamespaceRow("w2", b"{}")]),
 )
 """Atomic changes of the state. In Redis the batches of a closed run are dropped one by one, so none is left here."""
 
@@ -73,7 +75,7 @@ async def content_of(store):
         for run_id, found in batches.items()
         for batch in found
     }
-    shelves = {shelf: sorted(await store.rows(shelf), key=lambda row: row.key) for shelf in Shelf}
+    shelves = {shelf: sorted(await store.rows(shelf), key=lambda row: row.key) for shelf in Namespace}
     return runs, batches, rows, await store.workers(), shelves
 
 

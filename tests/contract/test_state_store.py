@@ -19,11 +19,11 @@ from embomatrix.manager.store.protocol import (
     Candidate,
     FencedError,
     Lead,
+    Namespace,
+    NamespaceRow,
     PutOutcome,
     ResultRow,
     RunRow,
-    Shelf,
-    ShelfRow,
     StateError,
     StateFullError,
 )
@@ -159,11 +159,11 @@ async def test_closing_a_run_deletes_its_batches_and_results(store):
 async def test_closing_a_run_deletes_its_window_only(store):
     for run_id in ("r1", "r2"):
         await store.open_run(RunRow(run_id, ""))
-    await store.put_rows(Shelf.WINDOWS, [ShelfRow("r1", b"of r1"), ShelfRow("r2", b"of r2")])
-    await store.put_rows(Shelf.SWITCHES, [ShelfRow("r1", b"on")])
+    await store.put_rows(Namespace.WINDOWS, [NamespaceRow("r1", b"of r1"), NamespaceRow("r2", b"of r2")])
+    await store.put_rows(Namespace.SWITCHES, [NamespaceRow("r1", b"on")])
     await store.close_run("r1")
-    assert await store.rows(Shelf.WINDOWS) == [ShelfRow("r2", b"of r2")]
-    assert await store.rows(Shelf.SWITCHES) == [ShelfRow("r1", b"on")]
+    assert await store.rows(Namespace.WINDOWS) == [NamespaceRow("r2", b"of r2")]
+    assert await store.rows(Namespace.SWITCHES) == [NamespaceRow("r1", b"on")]
 
 
 async def test_dropped_batch_leaves_the_others(store):
@@ -196,14 +196,17 @@ async def test_another_process_reads_the_same_state(store, openings):
     assert await again.results_after("r1", "b1", 1, 100) == rows(2)
 
 
-@pytest.mark.parametrize("shelf", Shelf)
+@pytest.mark.parametrize("shelf", Namespace)
 async def test_named_rows_survive_reopening_and_the_latest_counts(store, openings, shelf):
-    await store.put_rows(shelf, [ShelfRow("a", b"\x00first"), ShelfRow("b", b"of b")])
-    await store.put_rows(shelf, [ShelfRow("a", b"second\xff")])
+    await store.put_rows(shelf, [NamespaceRow("a", b"\x00first"), NamespaceRow("b", b"of b")])
+    await store.put_rows(shelf, [NamespaceRow("a", b"second\xff")])
     again = openings()
     found = await again.rows(shelf)
-    assert sorted(found, key=lambda row: row.key) == [ShelfRow("a", b"second\xff"), ShelfRow("b", b"of b")]
-    assert not any([await again.rows(other) for other in Shelf if other is not shelf])
+    assert sorted(found, key=lambda row: row.key) == [
+        NamespaceRow("a", b"second\xff"),
+        NamespaceRow("b", b"of b"),
+    ]
+    assert not any([await again.rows(other) for other in Namespace if other is not shelf])
 
 
 async def test_one_manager_leads_and_the_other_learns_its_address(store, openings):
@@ -267,7 +270,7 @@ async def test_only_the_latest_leader_may_write(store, openings):
         store.append_results([BatchResults("r1", "b1", rows(1))]),
         store.drop_batch("r1", "b1"),
         store.close_run("r1"),
-        store.put_rows(Shelf.CREDENTIALS, [ShelfRow("a", b"")]),
+        store.put_rows(Namespace.CREDENTIALS, [NamespaceRow("a", b"")]),
         store.put_workers(["w1"]),
     ):
         with pytest.raises(FencedError, match="another manager"):

@@ -238,11 +238,11 @@ class LeaseMachine(RuleBasedStateMachine):
             for worker in list(self.live):
                 self.worker_reports(worker, set(), False)
             for worker in list(self.live)[:-1]:
-                self.lease_ends(worker, None, 1)
+                self.lease_results(worker, None, 1)
             self.time_passes(0.5, True, 1)
 
     @rule(worker=workers, failing=st.sampled_from([None, None, None, *InfraCode]), repeats=st.integers(1, 2))
-    def lease_ends(self, worker, failing, repeats):
+    def lease_results(self, worker, failing, repeats):
         if not self.live.get(worker):
             return
         ref = next(iter(self.live[worker]))
@@ -343,7 +343,7 @@ class LeaseMachine(RuleBasedStateMachine):
         for _ in range(100):
             self.worker_reports("w1", set(), False)
             while self.live["w1"]:
-                self.lease_ends("w1", None, 1)
+                self.lease_results("w1", None, 1)
             self.time_passes(1.0, True, 1)
         assert set(self.delivered) == set(self.submitted)
         assert not self.cluster.dispatcher.live_leases

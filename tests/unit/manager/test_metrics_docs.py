@@ -12,7 +12,7 @@ from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.runtime.registry import LivenessLimits, Registry
 from embomatrix.manager.store.opening import open_store, timed_store
-from embomatrix.manager.store.protocol import Shelf
+from embomatrix.manager.store.protocol import Namespace
 from embomatrix.manager.web.prometheus import metrics_page
 
 GUIDE = Path(__file__).parents[3] / "docs" / "operations.md"
@@ -64,5 +64,5 @@ async def test_store_operations_are_timed():
     took = []
     store = timed_store(open_store("memory:"), lambda name, seconds: took.append((name, seconds >= 0.0)))
     assert await store.runs() == []
-    assert await store.rows(Shelf.CREDENTIALS) == []
+    assert await store.rows(Namespace.CREDENTIALS) == []
     assert took == [("runs", True), ("rows", True)]

@@ -12,10 +12,10 @@ from embomatrix.manager.runtime.serialization import (
 )
 from embomatrix.manager.store.protocol import (
     BatchRow,
+    Namespace,
+    NamespaceRow,
     ResultRow,
     RunRow,
-    Shelf,
-    ShelfRow,
     StateError,
     readable,
 )
@@ -26,8 +26,8 @@ DAMAGED = b"\xff\xff\xff"
 READERS = {
     "batch 'b1' of run 'r1'": lambda data: batch_of(BatchRow("r1", "b1", "", data)),
     "result of rollout 'x1'": lambda data: group_and_kind(ResultRow(1, "x1", data)),
-    "reputation of worker 'w1'": lambda data: reputation_of(ShelfRow("w1", data)),
-    "window of run 'r1'": lambda data: announced_in(ShelfRow("r1", data)),
+    "reputation of worker 'w1'": lambda data: reputation_of(NamespaceRow("w1", data)),
+    "window of run 'r1'": lambda data: announced_in(NamespaceRow("r1", data)),
     "terms of run 'r1'": lambda data: terms_of(RunRow("r1", "", data)),
 }
 
@@ -43,7 +43,7 @@ def test_damaged_row_is_named_with_the_remedy(name):
 )
 def test_reputation_with_other_fields_or_types_is_refused(fields):
     with pytest.raises(StateError, match="worker 'w1'"):
-        reputation_of(ShelfRow("w1", fields))
+        reputation_of(NamespaceRow("w1", fields))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_reputation_with_other_fields_or_types_is_refused(fields):
 )
 async def test_credential_with_other_fields_or_types_opens_no_gate(fields):
     store = SqliteStore(f"file:{__name__}{hash(fields)}?mode=memory&cache=shared")
-    store._db.execute("INSERT INTO shelf VALUES (?, 't1', ?)", (Shelf.CREDENTIALS.value, fields))
+    store._db.execute("INSERT INTO shelf VALUES (?, 't1', ?)", (Namespace.CREDENTIALS.value, fields))
     with pytest.raises(StateError, match="the credential 't1' in the state store can't be read"):
         await Gate(store, guarded=True).open()
     await store.close()

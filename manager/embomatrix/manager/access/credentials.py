@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import msgspec
 
-from embomatrix.manager.store.protocol import ShelfRow
+from embomatrix.manager.store.protocol import NamespaceRow
 from embomatrix.rpc.status import (
     InvalidRequestError,
     NotAllowedError,
@@ -64,8 +64,8 @@ class Credential:
         cls(**fields)  # refuses unknown fields
         return msgspec.convert(fields, cls)
 
-    def row(self) -> ShelfRow:
-        return ShelfRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())
+    def row(self) -> NamespaceRow:
+        return NamespaceRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())
 
     def named(self) -> str:
         """Return the token's name for messages."""

@@ -13,7 +13,7 @@ import grpc
 from embomatrix.manager.access.credentials import NO_TOKEN, Credential, CredentialBook, is_remembered
 from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
-from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError, StateStore, readable
+from embomatrix.manager.store.protocol import Namespace, NamespaceRow, StateError, StateStore, readable
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
 from embomatrix.rpc.status import (
     ClusterError,
@@ -63,11 +63,11 @@ class Gate:
         Raises AccessError for a shared token that was issued for a role, since it would become an admin's.
         """
         now_s = time.time()
-        known = [_credential_of(row) for row in await self._store.rows(Shelf.CREDENTIALS)]
+        known = [_credential_of(row) for row in await self._store.rows(Namespace.CREDENTIALS)]
         self._book.keep(*(credential for credential in known if is_remembered(credential, now_s=now_s)))
         fresh = [credential for credential in first if credential.token_id not in self._book]
         if fresh:
-            await self._store.put_rows(Shelf.CREDENTIALS, [credential.row() for credential in fresh])
+            await self._store.put_rows(Namespace.CREDENTIALS, [credential.row() for credential in fresh])
             self._book.keep(*fresh)
         if self._shared.partition(".")[0] in self._book:
             raise AccessError(
@@ -179,7 +179,9 @@ class Gate:
     async def _keep(self, *credentials: Credential) -> None:
         """Store the credentials before they take effect, so that grants and revocations survive a restart."""
         try:
-            await self._store.put_rows(Shelf.CREDENTIALS, [credential.row() for credential in credentials])
+            await self._store.put_rows(
+                Namespace.CREDENTIALS, [credential.row() for credential in credentials]
+            )
         except StateError as error:
             raise UnavailableError(str(error)) from error
         self._book.keep(*credentials)
@@ -209,6 +211,6 @@ def _token_in(context: grpc.aio.ServicerContext) -> str:
     return the_token([value for key, value in context.invocation_metadata() or () if key == TOKEN_KEY])
 
 
-def _credential_of(row: ShelfRow) -> Credential:
+def _credential_of(row: NamespaceRow) -> Credential:
     with readable(f"the credential {row.key!r}"):
         return Credential.of(parse_json(row.payload))

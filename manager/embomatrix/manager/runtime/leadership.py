@@ -9,7 +9,14 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Final
 
-from embomatrix.manager.store.protocol import Candidate, FencedError, Shelf, ShelfRow, StateError, StateStore
+from embomatrix.manager.store.protocol import (
+    Candidate,
+    FencedError,
+    Namespace,
+    NamespaceRow,
+    StateError,
+    StateStore,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +96,7 @@ async def warn_of_another_folder(store: StateStore, folder: Path) -> None:
     Managers of one state share a data folder, since bundles are files there. Each folder has a random id in a file,
     and the leader notes it in the state.
     """
-    noted = {row.key: row.payload for row in await store.rows(Shelf.SWITCHES)}.get(_KEY)
+    noted = {row.key: row.payload for row in await store.rows(Namespace.SWITCHES)}.get(_KEY)
     if noted is not None and noted != _mark_of(folder):
         logger.warning(
             "the data folder %s differs from that of the last leader on this state: bundles of its runs are missing here, "
@@ -100,15 +107,15 @@ async def warn_of_another_folder(store: StateStore, folder: Path) -> None:
 
 async def note_folder(store: StateStore, folder: Path) -> None:
     """Note this manager's data folder in the state. Raises StateError or OSError."""
-    await store.put_rows(Shelf.SWITCHES, [ShelfRow(_KEY, _mark_of(folder))])
+    await store.put_rows(Namespace.SWITCHES, [NamespaceRow(_KEY, _mark_of(folder))])
 
 
 async def lease_key(store: StateStore) -> bytes:
     """Return the cluster's secret for lease ids. The first leader creates it. Raises StateError."""
-    known = {row.key: row.payload for row in await store.rows(Shelf.SWITCHES)}.get(_LEASE_KEY)
+    known = {row.key: row.payload for row in await store.rows(Namespace.SWITCHES)}.get(_LEASE_KEY)
     if known is None:
         known = secrets.token_bytes(LEASE_KEY_BYTES)
-        await store.put_rows(Shelf.SWITCHES, [ShelfRow(_LEASE_KEY, known)])
+        await store.put_rows(Namespace.SWITCHES, [NamespaceRow(_LEASE_KEY, known)])
     return known
 
 

@@ -35,9 +35,9 @@ from embomatrix.manager.runtime.serialization import (
     terms_payload,
 )
 from embomatrix.manager.store.protocol import (
+    Namespace,
     PutOutcome,
     RunRow,
-    Shelf,
     StateError,
     StateFullError,
     StateStore,
@@ -110,7 +110,7 @@ class Runs:
 
     async def restore(self) -> None:
         """Restore the runs of a former manager. Open batches continue at once, without a call of their trainer."""
-        announced = {row.key: announced_in(row) for row in await self._store.rows(Shelf.WINDOWS)}
+        announced = {row.key: announced_in(row) for row in await self._store.rows(Namespace.WINDOWS)}
         for run in await self._store.runs():
             self._runs[run.run_id] = run
             terms = terms_of(run)

@@ -15,7 +15,7 @@ import msgspec
 from embomatrix.manager.control.events import LookaheadAnnounced
 from embomatrix.manager.control.reputation import Reputation
 from embomatrix.manager.control.schedule.lookahead import LookaheadWindow
-from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, ShelfRow, readable
+from embomatrix.manager.store.protocol import BatchRow, NamespaceRow, ResultRow, RunRow, readable
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.wire.codec import each
 from embomatrix.rpc.wire.outcome import rollout_result_to_proto
@@ -82,13 +82,13 @@ def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
     return ResultRow(row.cursor, row.rollout_id, row.payload + _DELIVERED + _DOUBLE.pack(deliver_s))
 
 
-def reputation_row(worker_id: str, worker_reputation: Reputation) -> ShelfRow:
+def reputation_row(worker_id: str, worker_reputation: Reputation) -> NamespaceRow:
     """Return the row of a reputation. Open disputes are dropped, since their rollouts are executed again."""
     kept = {name: value for name, value in asdict(worker_reputation).items() if name != "disputed"}
-    return ShelfRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
+    return NamespaceRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
 
 
-def reputation_of(row: ShelfRow) -> Reputation:
+def reputation_of(row: NamespaceRow) -> Reputation:
     """Return the reputation of `reputation_row`. Raises StateError."""
     with readable(f"the reputation of worker {row.key!r}"):
         fields = parse_json(row.payload)
@@ -96,14 +96,14 @@ def reputation_of(row: ShelfRow) -> Reputation:
         return msgspec.convert(fields, Reputation)
 
 
-def window_row(run_id: str, window: LookaheadWindow) -> ShelfRow:
+def window_row(run_id: str, window: LookaheadWindow) -> NamespaceRow:
     """Return the row of a run's remaining look-ahead window."""
     entries = [lookahead_entry_to_proto(entry) for entry in window.entries]
     message = rollout_service_pb2.AnnounceLookaheadRequest(version=window.version, entries=entries)
-    return ShelfRow(run_id, message.SerializeToString())
+    return NamespaceRow(run_id, message.SerializeToString())
 
 
-def announced_in(row: ShelfRow) -> LookaheadAnnounced:
+def announced_in(row: NamespaceRow) -> LookaheadAnnounced:
     """Return the window of `window_row`, as an announcement. Raises StateError."""
     with readable(f"the look-ahead window of run {row.key!r}"):
         message = rollout_service_pb2.AnnounceLookaheadRequest.FromString(row.payload)

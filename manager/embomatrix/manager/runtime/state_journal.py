@@ -9,7 +9,7 @@ from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.events import ReputationsKnown
 from embomatrix.manager.runtime.registry import Registry
 from embomatrix.manager.runtime.serialization import reputation_of, reputation_row, window_row
-from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError, StateStore
+from embomatrix.manager.store.protocol import Namespace, NamespaceRow, StateError, StateStore
 from embomatrix.rpc.status import UnavailableError
 
 logger = logging.getLogger(__name__)
@@ -39,18 +39,18 @@ class StateJournal:
 
     async def reputations(self) -> ReputationsKnown:
         """Return the reputations that former managers stored."""
-        rows = await self._store.rows(Shelf.REPUTATIONS)
+        rows = await self._store.rows(Namespace.REPUTATIONS)
         return ReputationsKnown({row.key: reputation_of(row) for row in rows})
 
     async def paused(self) -> bool:
         """Return True if an operator paused dispatch and did not resume it."""
-        return ShelfRow(_DISPATCH, _PAUSED) in await self._store.rows(Shelf.SWITCHES)
+        return NamespaceRow(_DISPATCH, _PAUSED) in await self._store.rows(Namespace.SWITCHES)
 
     async def note_pause(self, paused: bool) -> None:
         """Store the pause. Raises UnavailableError if that fails: the pause then holds for this process only."""
-        row = ShelfRow(_DISPATCH, _PAUSED if paused else b"")
+        row = NamespaceRow(_DISPATCH, _PAUSED if paused else b"")
         try:
-            await self._store.put_rows(Shelf.SWITCHES, [row])
+            await self._store.put_rows(Namespace.SWITCHES, [row])
         except StateError as error:
             done = "paused" if paused else "resumed"
             raise UnavailableError(
@@ -112,7 +112,7 @@ class StateJournal:
         if not rows:
             return
         with contextlib.suppress(StateError):
-            await self._store.put_rows(Shelf.WINDOWS, rows)
+            await self._store.put_rows(Namespace.WINDOWS, rows)
             self._announced = now
 
     async def _note_reputations(self) -> None:
@@ -122,6 +122,6 @@ class StateJournal:
         if not rows:
             return
         try:
-            await self._store.put_rows(Shelf.REPUTATIONS, rows)
+            await self._store.put_rows(Namespace.REPUTATIONS, rows)
         except StateError:
             auditor.note(*changed)

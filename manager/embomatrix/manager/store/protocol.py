@@ -105,7 +105,7 @@ class BatchResults:
     rows: Sequence[ResultRow]
 
 
-class Shelf(StrEnum):
+class Namespace(StrEnum):
     """Named rows beside the runs, for later managers."""
 
     CREDENTIALS = "credentials"
@@ -119,7 +119,7 @@ class Shelf(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class ShelfRow:
+class NamespaceRow:
     """Named row; ``payload`` is opaque to the store."""
 
     key: str
@@ -171,10 +171,10 @@ class StateStore(Protocol):
     async def workers(self) -> frozenset[str]:
         """Return the list of present workers."""
 
-    async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
+    async def put_rows(self, namespace: Namespace, rows: Sequence[NamespaceRow]) -> None:
         """Store rows in one atomic write, replacing rows of the same key."""
 
-    async def rows(self, shelf: Shelf) -> list[ShelfRow]:
+    async def rows(self, namespace: Namespace) -> list[NamespaceRow]:
         """Return the latest row of every key, in any order."""
 
     async def close(self) -> None:

@@ -21,11 +21,11 @@ from embomatrix.manager.store.protocol import (
     Candidate,
     FencedError,
     Lead,
+    Namespace,
+    NamespaceRow,
     PutOutcome,
     ResultRow,
     RunRow,
-    Shelf,
-    ShelfRow,
     StateError,
     StateFullError,
     readable,
@@ -150,7 +150,7 @@ class RedisStore:
     async def close_run(self, run_id: str) -> None:
         for batch_id in await self._batch_ids(run_id):
             await self.drop_batch(run_id, batch_id)
-        keys = ("runs", "run_order", f"batches:{run_id}", "run_terms", Shelf.WINDOWS.value)
+        keys = ("runs", "run_order", f"batches:{run_id}", "run_terms", Namespace.WINDOWS.value)
         await self._script(_CLOSE_RUN, keys, run_id)
 
     async def put_batch(self, batch: BatchRow) -> PutOutcome:
@@ -205,14 +205,14 @@ class RedisStore:
         with readable("a worker's name"):
             return frozenset(worker_id.decode() for worker_id in found)
 
-    async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
+    async def put_rows(self, namespace: Namespace, rows: Sequence[NamespaceRow]) -> None:
         flat = [value for row in rows for value in (row.key, row.payload)]
-        await self._script(_PUT_ROWS, (shelf.value,), *flat)
+        await self._script(_PUT_ROWS, (namespace.value,), *flat)
 
-    async def rows(self, shelf: Shelf) -> list[ShelfRow]:
-        found = await self._call(self._redis.hgetall(self._key(shelf.value)))
-        with readable(f"a row of {shelf.value}"):
-            return [ShelfRow(key.decode(), payload) for key, payload in found.items()]
+    async def rows(self, namespace: Namespace) -> list[NamespaceRow]:
+        found = await self._call(self._redis.hgetall(self._key(namespace.value)))
+        with readable(f"a row of {namespace.value}"):
+            return [NamespaceRow(key.decode(), payload) for key, payload in found.items()]
 
     async def close(self) -> None:
         with contextlib.suppress(StateError):

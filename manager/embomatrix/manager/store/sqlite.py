@@ -15,11 +15,11 @@ from embomatrix.manager.store.protocol import (
     Candidate,
     FencedError,
     Lead,
+    Namespace,
+    NamespaceRow,
     PutOutcome,
     ResultRow,
     RunRow,
-    Shelf,
-    ShelfRow,
     StateError,
     StateFullError,
 )
@@ -129,7 +129,9 @@ class SqliteStore:
         def delete() -> None:
             for table in ("result", "batch", "run"):
                 self._db.execute(f"DELETE FROM {table} WHERE run_id = ?", (run_id,))
-            self._db.execute("DELETE FROM shelf WHERE shelf = ? AND key = ?", (Shelf.WINDOWS.value, run_id))
+            self._db.execute(
+                "DELETE FROM shelf WHERE shelf = ? AND key = ?", (Namespace.WINDOWS.value, run_id)
+            )
 
         await self._run(delete)
 
@@ -192,13 +194,13 @@ class SqliteStore:
     async def workers(self) -> frozenset[str]:
         return frozenset(row[0] for row in await self._read("SELECT worker_id FROM worker"))
 
-    async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
-        values = [(shelf.value, row.key, row.payload) for row in rows]
+    async def put_rows(self, namespace: Namespace, rows: Sequence[NamespaceRow]) -> None:
+        values = [(namespace.value, row.key, row.payload) for row in rows]
         await self._run(lambda: self._db.executemany("INSERT OR REPLACE INTO shelf VALUES (?, ?, ?)", values))
 
-    async def rows(self, shelf: Shelf) -> list[ShelfRow]:
+    async def rows(self, namespace: Namespace) -> list[NamespaceRow]:
         query = "SELECT key, payload FROM shelf WHERE shelf = ?"
-        return [ShelfRow(*row) for row in await self._read(query, shelf.value)]
+        return [NamespaceRow(*row) for row in await self._read(query, namespace.value)]
 
     async def close(self) -> None:
         with contextlib.suppress(StateError):

@@ -16,7 +16,7 @@ from embomatrix.manager.control.dispatch.leasing import (
     revoke,
     with_free_slot_for,
 )
-from embomatrix.manager.control.dispatch.outcomes import close_case, deliver, return_lease
+from embomatrix.manager.control.dispatch.outcomes import close_case, deliver, end_and_requeue
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutRecord
 from embomatrix.manager.control.dispatch.state import AuditCase, DispatchState
 from embomatrix.manager.control.reputation import OPINIONS, judge, opinion_of
@@ -25,7 +25,7 @@ from embomatrix.rpc.wire.run_log import RolloutStepKind
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome
 
 NOT_CONFIRMED: Final = "the second execution that should have confirmed the result was cancelled"
-LOOKED_AT: Final = 256
+EXAMINED_PER_TICK: Final = 256
 """Audits examined at each tick, in rotation."""
 
 
@@ -94,7 +94,7 @@ def note_probation(state: DispatchState, worker_id: str) -> None:
 
 def tick_audits(state: DispatchState) -> None:
     """Give idle slots to checks that can wait, and end cases that no worker could check for long enough."""
-    some = list(islice(state.cases.items(), LOOKED_AT))
+    some = list(islice(state.cases.items(), EXAMINED_PER_TICK))
     for key, case in some:
         del state.cases[key]
         state.cases[key] = case
@@ -191,7 +191,7 @@ def quarantine(state: DispatchState, worker_id: str, reason: str) -> None:
         leases = list(worker.held.values())
         for lease in leases:
             state.emit(CancelLease(worker_id, lease.ref))
-            return_lease(state, lease, "its worker is in quarantine")
+            end_and_requeue(state, lease, "its worker is in quarantine")
         for scene in dict.fromkeys(lease.record.scene for lease in leases):
             offer_scene(state, scene)
 

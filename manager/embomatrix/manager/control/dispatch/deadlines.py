@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from embomatrix.manager.control.dispatch.audits import finish, tick_audits
-from embomatrix.manager.control.dispatch.lease_ends import judge_scene, take_away
+from embomatrix.manager.control.dispatch.lease_results import fail_unloadable_scene, revoke_failed_lease
 from embomatrix.manager.control.dispatch.leasing import fill_workers, hedge_late
 from embomatrix.manager.control.dispatch.membership import release_awaited
 from embomatrix.manager.control.dispatch.records import LeaseRecord
@@ -29,7 +29,9 @@ def renew_leases(state: DispatchState, event: LeasesRenewed) -> None:
         still_s = state.now_s - max(lease.started_s, lease.moved_s)
         if still_s >= _stall_after_s(state, lease):
             text = f"{event.worker_id} did no step for {still_s:.0f} s, after {max(lease.steps, 0)}"
-            take_away(state, lease, InfraFailure(InfraCode.STALLED, text, event.worker_id), started=True)
+            revoke_failed_lease(
+                state, lease, InfraFailure(InfraCode.STALLED, text, event.worker_id), started=True
+            )
 
 
 def tick(state: DispatchState) -> None:
@@ -44,7 +46,7 @@ def tick(state: DispatchState) -> None:
         finish(state, record, failure)
     state.load_failures.forget_old(state.now_s)
     for scene in state.load_failures.scenes():
-        judge_scene(state, scene)
+        fail_unloadable_scene(state, scene)
     _fail_unplaceable(state)
     _fill_idle(state)
     hedge_late(state)
@@ -74,7 +76,7 @@ def _expire(state: DispatchState, lease: LeaseRecord, *, started: bool) -> None:
     if lease in lease.record.leases:
         state.log(RolloutStepKind.EXPIRED, lease.record.key, lease.worker_id, message)
     failure = InfraFailure(InfraCode.LEASE_EXPIRED, message, lease.worker_id)
-    take_away(state, lease, failure, started=started)
+    revoke_failed_lease(state, lease, failure, started=started)
 
 
 def _fail_unplaceable(state: DispatchState) -> None:

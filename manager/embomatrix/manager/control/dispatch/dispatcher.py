@@ -13,7 +13,7 @@ A pure state machine: ``handle`` is the only way to change it, the clock is an a
 * Runs share slot time by weight: see ``fair_share``.
 
 `DispatchState` owns all state. The other modules of this package are functions of it, in layers: ``leasing``, ``outcomes``,
-``audits``, ``lease_ends``, ``membership``, ``deadlines``; each uses only those before it.
+``audits``, ``lease_results``, ``membership``, ``deadlines``; each uses only those before it.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from embomatrix.manager.control.commands import ManagerCommand
 from embomatrix.manager.control.dispatch.audits import drop_run, quarantine
 from embomatrix.manager.control.dispatch.deadlines import note_unplaceable, renew_leases, tick
-from embomatrix.manager.control.dispatch.lease_ends import settle_result
+from embomatrix.manager.control.dispatch.lease_results import settle_result
 from embomatrix.manager.control.dispatch.leasing import fill_freed, fill_workers
 from embomatrix.manager.control.dispatch.membership import (
     restore_batch,

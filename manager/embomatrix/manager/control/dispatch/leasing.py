@@ -11,7 +11,7 @@ from embomatrix.manager.control.dispatch.state import DispatchState
 from embomatrix.manager.control.workers import WorkerRecord
 from embomatrix.rpc.wire.run_log import RolloutStepKind
 
-LOOKED_AT: Final = 256
+EXAMINED_PER_TICK: Final = 256
 """Rollouts of tails examined for hedging at each tick, in rotation."""
 SLOW: Final = 2.0
 """A lease is late after this multiple of the 95th percentile of its run's slot times."""
@@ -150,9 +150,9 @@ def _tail_rollouts(state: DispatchState) -> list[RolloutRecord]:
     tails = state.batches.tails
     records: list[RolloutRecord] = []
     for group in list(tails):
-        if len(records) >= LOOKED_AT:
+        if len(records) >= EXAMINED_PER_TICK:
             break
-        records += islice(group.open.values(), LOOKED_AT - len(records))
+        records += islice(group.open.values(), EXAMINED_PER_TICK - len(records))
         del tails[group]
         tails[group] = None
     return list(dict.fromkeys(records))

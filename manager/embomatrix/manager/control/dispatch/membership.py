@@ -6,7 +6,7 @@ they hold, with epochs and rollouts, and the new manager adopts them. Restored r
 
 from embomatrix.manager.control.commands import CancelLease
 from embomatrix.manager.control.dispatch.audits import restore_quarantine
-from embomatrix.manager.control.dispatch.lease_ends import give_back, judge_scene
+from embomatrix.manager.control.dispatch.lease_results import end_failed_lease, fail_unloadable_scene
 from embomatrix.manager.control.dispatch.leasing import fill_workers, offer_scene, queue_rollouts, revoke
 from embomatrix.manager.control.dispatch.outcomes import open_batch
 from embomatrix.manager.control.dispatch.records import DispatchPhase
@@ -48,7 +48,7 @@ def worker_reported(state: DispatchState, event: WorkerReported) -> None:
         if resident.state is ResidentState.FAILED:
             scene = resident.bundle_digest
             state.load_failures.record(scene, worker.worker_id, resident.error, state.now_s)
-            judge_scene(state, scene)
+            fail_unloadable_scene(state, scene)
     fill_workers(state, (worker.worker_id,))
 
 
@@ -62,7 +62,7 @@ def worker_lost(state: DispatchState, event: WorkerLost) -> None:
     state.auditor.forget_blank(worker.worker_id)
     failure = InfraFailure(InfraCode.WORKER_LOST, f"worker lost: {event.reason}", worker.worker_id)
     for lease in leases:
-        give_back(state, lease, failure, counted=lease.started_s is not None)
+        end_failed_lease(state, lease, failure, counted=lease.started_s is not None)
     for scene in dict.fromkeys(lease.record.scene for lease in leases):
         offer_scene(state, scene)
 
@@ -114,7 +114,7 @@ def _reconcile(state: DispatchState, worker: WorkerRecord, event: WorkerReported
         InfraCode.WORKER_LOST, "the lease was lost with a broken session", worker.worker_id
     )
     for lease in [lease for lease in worker.held.values() if lease.ref not in held]:
-        give_back(state, lease, failure, counted=False)
+        end_failed_lease(state, lease, failure, counted=False)
         offer_scene(state, lease.record.scene)
     if state.expected_workers is not None:
         state.expected_workers.discard(worker.worker_id)

@@ -75,7 +75,7 @@ def deliver(state: DispatchState, record: RolloutRecord, outcome: Outcome) -> No
         _fail_group(state, batch, group, policy, f"rollout {record.key.rollout_id} was lost: {outcome.code}")
 
 
-def return_lease(state: DispatchState, lease: LeaseRecord, why: str) -> None:
+def end_and_requeue(state: DispatchState, lease: LeaseRecord, why: str) -> None:
     """End a lease without a result; queue the rollout again unless another lease of it is live."""
     record = lease.record
     state.log(RolloutStepKind.RETURNED, record.key, lease.worker_id, why)

@@ -141,7 +141,7 @@ class ResidencyPlan:
 
     desired: Mapping[str, tuple[str, ...]]
     """Scenes of each examined worker, most urgent first; the other workers keep theirs."""
-    homeless: tuple[str, ...]
+    unplaced: tuple[str, ...]
     """Needed scenes that no worker has room for."""
 
 
@@ -163,7 +163,7 @@ def needs_of(pending: Mapping[str, int], windows: Iterable[Sequence[LookaheadEnt
     return list(needs.values())
 
 
-class _Shelf:
+class _WorkerPlan:
     """Desired set of one worker while it is filled."""
 
     def __init__(self, site: Site, size_mb: Callable[[str], float]) -> None:
@@ -200,44 +200,44 @@ class _Shelf:
         return (self.work + unit) / self.site.capacity, self.site.worker_id
 
 
-class _Shelves:
-    """Shelves of the examined workers. The others have no work and follow in order of capacity."""
+class _WorkerPlans:
+    """Plans of the examined workers. The others have no work and follow in order of capacity."""
 
     def __init__(self, sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> None:
         self._sites = sites
         self._size_mb = size_mb
         self._smallest_mb = min((size_mb(need.bundle_digest) for need in needs), default=0.0)
         self._unit = sum(need.count for need in needs) / max(len(needs), 1)
-        self._opened: dict[str, _Shelf] = {}
+        self._opened: dict[str, _WorkerPlan] = {}
         self._unopened = iter(sites.ids)
         self._queue: list[tuple[float, str]] = []
         self._border = ""
-        self._move_border()
+        self._open_next_worker()
 
-    def of(self, worker_id: str) -> _Shelf:
-        shelf = self._opened.get(worker_id)
-        if shelf is None:
-            shelf = self._opened[worker_id] = _Shelf(self._sites.site(worker_id), self._size_mb)
-            heapq.heappush(self._queue, shelf.order(self._unit))
-        return shelf
+    def of(self, worker_id: str) -> _WorkerPlan:
+        plan = self._opened.get(worker_id)
+        if plan is None:
+            plan = self._opened[worker_id] = _WorkerPlan(self._sites.site(worker_id), self._size_mb)
+            heapq.heappush(self._queue, plan.order(self._unit))
+        return plan
 
-    def add_work(self, shelf: _Shelf, work: float) -> None:
-        shelf.work += work
-        heapq.heappush(self._queue, shelf.order(self._unit))
+    def add_work(self, plan: _WorkerPlan, work: float) -> None:
+        plan.work += work
+        heapq.heappush(self._queue, plan.order(self._unit))
 
-    def in_order(self, shelves: Iterable[_Shelf]) -> list[_Shelf]:
-        return sorted(shelves, key=lambda shelf: shelf.order(self._unit))
+    def in_order(self, plans: Iterable[_WorkerPlan]) -> list[_WorkerPlan]:
+        return sorted(plans, key=lambda plan: plan.order(self._unit))
 
-    def accepting(self, scene: str) -> Generator[_Shelf]:
-        """Yield shelves without the scene that accept it, least loaded first. Close the generator after the last."""
+    def accepting(self, scene: str) -> Generator[_WorkerPlan]:
+        """Yield plans without the scene that accept it, least loaded first. Close the generator after the last."""
         passed: list[tuple[float, str]] = []
         try:
-            while (shelf := self._next()) is not None:
-                # A shelf without room for the smallest scene is never examined again.
-                if not shelf.chosen or shelf.free_mb >= self._smallest_mb:
-                    passed.append(shelf.order(self._unit))
-                if scene not in shelf.chosen and shelf.accepts(scene):
-                    yield shelf
+            while (plan := self._next()) is not None:
+                # A worker without room for the smallest scene is never examined again.
+                if not plan.chosen or plan.free_mb >= self._smallest_mb:
+                    passed.append(plan.order(self._unit))
+                if scene not in plan.chosen and plan.accepts(scene):
+                    yield plan
         finally:
             for order in passed:
                 heapq.heappush(self._queue, order)
@@ -245,23 +245,23 @@ class _Shelves:
     def close(self) -> dict[str, tuple[str, ...]]:
         for worker_id in sorted(self._sites.changed()):
             self.of(worker_id)
-        for shelf in self._opened.values():
-            shelf.keep_the_rest()
+        for plan in self._opened.values():
+            plan.keep_the_rest()
         return {worker_id: tuple(self._opened[worker_id].chosen) for worker_id in sorted(self._opened)}
 
-    def _next(self) -> _Shelf | None:
-        """Pop the least loaded shelf."""
+    def _next(self) -> _WorkerPlan | None:
+        """Pop the plan of the least loaded worker."""
         while self._queue:
             order = heapq.heappop(self._queue)
             if order[1] == self._border:
-                self._move_border()
-            shelf = self._opened[order[1]]
-            # Entries from before the shelf got more work are stale.
-            if order == shelf.order(self._unit):
-                return shelf
+                self._open_next_worker()
+            plan = self._opened[order[1]]
+            # Entries from before the plan got more work are stale.
+            if order == plan.order(self._unit):
+                return plan
         return None
 
-    def _move_border(self) -> None:
+    def _open_next_worker(self) -> None:
         """Open the next worker without work; every other one sorts after it."""
         self._border = next((name for name in self._unopened if name not in self._opened), "")
         if self._border:
@@ -270,7 +270,7 @@ class _Shelves:
 
 def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> ResidencyPlan:
     """Compute the desired sets. ``size_mb`` estimates the memory of a scene. Deterministic."""
-    shelves = _Shelves(sites, needs, size_mb)
+    plans = _WorkerPlans(sites, needs, size_mb)
     wanted = _SlotsWanted(needs, sites.slots)
     having = {need.bundle_digest: sorted(sites.having(need.bundle_digest)) for need in needs}
     # Of equal rank, resident scenes go first: evicting one to load another only costs a load.
@@ -278,16 +278,18 @@ def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) 
         needs, key=lambda n: (n.rank, not having[n.bundle_digest], n.turn, -n.count, n.bundle_digest)
     )
     ordered = in_turns(ordered, lambda need: size_mb(need.bundle_digest))
-    homeless: list[str] = []
+    unplaced: list[str] = []
     for _, group in itertools.groupby(ordered, key=lambda need: need.rank):
-        spreads = [_Spread(need, wanted.of(need), shelves, having[need.bundle_digest]) for need in group]
+        spreads = [
+            _ReplicaPlacement(need, wanted.of(need), plans, having[need.bundle_digest]) for need in group
+        ]
         # A first copy of each before a second of any: no second copy displaces another scene's only one.
         for spread in spreads:
             spread.place_one()
         for spread in spreads:
             spread.place_more()
-        homeless += [spread.need.bundle_digest for spread in spreads if not spread.placed]
-    return ResidencyPlan(shelves.close(), tuple(homeless))
+        unplaced += [spread.need.bundle_digest for spread in spreads if not spread.placed]
+    return ResidencyPlan(plans.close(), tuple(unplaced))
 
 
 class _SlotsWanted:
@@ -308,67 +310,67 @@ class _SlotsWanted:
         return min(need.count, math.ceil(part - 1e-9))
 
 
-class _Spread:
+class _ReplicaPlacement:
     """Placement of one need: first on workers that have the scene, then on the least loaded ones."""
 
-    def __init__(self, need: Need, slots: int, shelves: _Shelves, having: Sequence[str]) -> None:
+    def __init__(self, need: Need, slots: int, plans: _WorkerPlans, having: Sequence[str]) -> None:
         self.need = need
-        self.placed: list[_Shelf] = []
+        self.placed: list[_WorkerPlan] = []
         self._slots = slots
-        self._shelves = shelves
-        self._here = [shelves.of(worker_id) for worker_id in having]
+        self._plans = plans
+        self._here = [plans.of(worker_id) for worker_id in having]
 
     def place_one(self) -> None:
         """Place one copy, with all the work."""
         scene = self.need.bundle_digest
         # Pinned copies stay and need no room.
-        here = sorted(self._shelves.in_order(self._here), key=lambda shelf: scene not in shelf.chosen)
-        for shelf in here:
-            if scene in shelf.chosen or shelf.accepts(scene):
-                self._put(shelf)
+        here = sorted(self._plans.in_order(self._here), key=lambda plan: scene not in plan.chosen)
+        for plan in here:
+            if scene in plan.chosen or plan.accepts(scene):
+                self._put(plan)
                 break
         else:
             self._put_on_others(one=True)
         if self.placed:
-            self._shelves.add_work(self.placed[0], self.need.count)
+            self._plans.add_work(self.placed[0], self.need.count)
 
     def place_more(self) -> None:
         """Place more copies while they pay off, and share the work among all."""
         if not self.placed or not self._wants_more():
             return
         scene = self.need.bundle_digest
-        for shelf in self._shelves.in_order(self._here):
-            if shelf in self.placed or not self._wants_more():
+        for plan in self._plans.in_order(self._here):
+            if plan in self.placed or not self._wants_more():
                 continue
-            if scene in shelf.chosen or shelf.accepts(scene):
-                self._put(shelf)
+            if scene in plan.chosen or plan.accepts(scene):
+                self._put(plan)
         if self._wants_more():
             self._put_on_others(one=False)
         capacity = self._capacity()
-        self._shelves.add_work(self.placed[0], -self.need.count)
-        for shelf in self.placed:
-            self._shelves.add_work(shelf, self.need.count * shelf.site.capacity / capacity)
+        self._plans.add_work(self.placed[0], -self.need.count)
+        for plan in self.placed:
+            self._plans.add_work(plan, self.need.count * plan.site.capacity / capacity)
 
     def _put_on_others(self, *, one: bool) -> None:
-        with contextlib.closing(self._shelves.accepting(self.need.bundle_digest)) as others:
-            for shelf in others:
-                self._put(shelf)
+        with contextlib.closing(self._plans.accepting(self.need.bundle_digest)) as others:
+            for plan in others:
+                self._put(plan)
                 if one or not self._wants_more():
                     break
 
-    def _put(self, shelf: _Shelf) -> None:
-        if self.need.bundle_digest not in shelf.chosen:
-            shelf.take(self.need.bundle_digest)
-        self.placed.append(shelf)
+    def _put(self, plan: _WorkerPlan) -> None:
+        if self.need.bundle_digest not in plan.chosen:
+            plan.take(self.need.bundle_digest)
+        self.placed.append(plan)
 
     def _wants_more(self) -> bool:
         """True if one more copy has slots to use and would load before the others finish the work."""
         if len(self.placed) < self.need.at_least:
             return True
-        if sum(shelf.site.slots for shelf in self.placed) >= self._slots:
+        if sum(plan.site.slots for plan in self.placed) >= self._slots:
             return False
         known = self.need.load_s and self.need.work_s
         return not known or self.need.work_s / self._capacity() > self.need.load_s
 
     def _capacity(self) -> float:
-        return sum(shelf.site.capacity for shelf in self.placed)
+        return sum(plan.site.capacity for plan in self.placed)

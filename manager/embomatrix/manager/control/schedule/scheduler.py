@@ -145,7 +145,7 @@ class Scheduler:
         )
         placement = place(sites, needs, self._costs.size_mb)
         self._residencies.fresh.clear()
-        refused = [scene for scene in placement.homeless if sites.all_refuse(scene)]
+        refused = [scene for scene in placement.unplaced if sites.all_refuse(scene)]
         self.unplaceable = self._refusal_reasons(refused) if refused else {}
         self.cost = len(needs) + len(placement.desired) + len(self._demand.in_use) // LEASES_AT_A_TIME
         orders = (self._order(name, scenes) for name, scenes in placement.desired.items())

@@ -49,7 +49,9 @@ def _outdated(worker_id: str, lacks: str) -> InfraFailure:
     return InfraFailure(InfraCode.VERSION_SKEW, f"{worker_id} does not know {lacks}: upgrade it", worker_id)
 
 
-def give_back(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, counted: bool) -> None:
+def end_failed_lease(
+    state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, counted: bool
+) -> None:
     """End a lease that brought no result. The rollout is queued again, or fails after its last attempt.
 
     Only ``counted`` ends cost an attempt. A lease that ended with its group a moment ago is left alone.
@@ -84,16 +86,18 @@ def _most_attempts(state: DispatchState, record: RolloutRecord, failure: InfraFa
     return state.limits.max_attempts
 
 
-def take_away(state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, started: bool) -> None:
+def revoke_failed_lease(
+    state: DispatchState, lease: LeaseRecord, failure: InfraFailure, *, started: bool
+) -> None:
     """Revoke a lease whose worker failed it; another worker gets the rollout."""
     if lease not in lease.record.leases:
         return  # it ended with its group a moment ago
     state.emit(CancelLease(lease.worker_id, lease.ref))
-    give_back(state, lease, failure, counted=started)
+    end_failed_lease(state, lease, failure, counted=started)
     offer_scene(state, lease.record.scene)
 
 
-def judge_scene(state: DispatchState, scene: str) -> None:
+def fail_unloadable_scene(state: DispatchState, scene: str) -> None:
     """Fail the waiting rollouts of a scene that no worker can load."""
     if state.pool.has_warm(scene) or not state.queues.count(scene):
         return
@@ -130,6 +134,6 @@ def _fail(state: DispatchState, lease: LeaseRecord, failure: InfraFailure) -> No
         # Not warm until the worker reports again: the rollout would come straight back.
         state.pool.set_warm(worker, worker.warm - {scene})
         state.load_failures.record(scene, worker.worker_id, failure.message, state.now_s)
-    give_back(state, lease, failure, counted=True)
-    judge_scene(state, scene)
+    end_failed_lease(state, lease, failure, counted=True)
+    fail_unloadable_scene(state, scene)
     offer_scene(state, scene)
