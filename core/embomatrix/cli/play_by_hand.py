@@ -15,7 +15,7 @@ from embomatrix.world.task import Task
 
 HELP: Final = (
     "One call a line, with a row or a name: `move 3`, `pick_up apple_1`, `place 0 inside`. `state` shows where everything is, "
-    "`restart` begins again, `help` lists the calls, `quit` ends. A failed call changes nothing."
+    "`restart` begins again, `help` lists the calls, `done` or `quit` ends. A failed call changes nothing."
 )
 
 EXPLORING: Final = (
@@ -35,7 +35,7 @@ def play_by_hand(
     show(HELP)
     reward: RewardBreakdown | None = None
     done: list[SkillCall] = []
-    while (line := read()) is not None and (words := line.split()) != ["quit"]:
+    while (line := read()) is not None and (words := line.split()) not in (["quit"], ["done"]):
         if words == ["state"]:
             show("\n".join(episode.state()))
         elif words == ["help"]:
@@ -101,7 +101,14 @@ def explore_by_hand(
 
 def call_in(line: str, task: Task) -> SkillCall:
     """Return the one call in a line, in which names of objects stand for their rows. Raises PlanError."""
-    plan = plan_with_names(line, task)
+    try:
+        plan = plan_with_names(line, task)
+    except PlanError as error:
+        if error.reason is PlanReason.NO_PLAN:
+            raise PlanError(
+                PlanReason.NO_PLAN, f"found {line.strip()[:80]!r}: expected one call, such as `move 3`"
+            ) from error
+        raise
     if len(plan) != 1:
         raise PlanError(PlanReason.TOO_MANY_STEPS, f"found {len(plan)} calls: expected one call a line")
     return plan[0]

@@ -180,13 +180,14 @@ def test_table_and_prompt_of_a_task_are_shown_without_execution(run):
 
 
 def test_task_is_played_by_hand_call_by_call(run):
-    typed = "pick_up apple_1\nturn 90\nturn 6\ndance 3\nhelp\npick_up aple_1\n"
+    typed = "pick_up apple_1\nturn 90\nturn 6\ndance 3\nfoo\nhelp\npick_up aple_1\n"
     typed += "move apple_1\nstate\npick_up 10\nmove countertop_1\nplace 0 ontop\nmove 1\n"
     result = run("apple_to_counter", "--interactive", text=typed)
     assert result.exit_code == 0, result.output
     printed = " ".join(result.output.split())
     assert "✗ apple_1 is" in printed, "a failed call changes nothing"
     assert "unknown skill 'dance'" in printed
+    assert "found 'foo': expected one call, such as `move 3`" in printed
     assert "move object" in printed, "`help` lists the calls"
     assert "turn radians" in printed
     assert "turn by 90 radians, which is more than a full turn; 90 degrees are 1.57" in printed
@@ -197,6 +198,8 @@ def test_task_is_played_by_hand_call_by_call(run):
     assert "Reward" in printed
     assert "✓ stands at" not in printed.split("the goal is reached")[1], "the task ends at the goal"
     assert "Reward" not in run("apple_to_counter", "--interactive", text="move 10\nrestart\n").output
+    ended = run("apple_to_counter", "--interactive", text="move 10\ndone\nmove 0\n").output
+    assert ended.count("✓ stands at") == 1
 
 
 def test_newest_checkpoint_of_a_run_writes_the_plan(run, folder, tmp_path):

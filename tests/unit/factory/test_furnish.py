@@ -104,7 +104,7 @@ def test_worktop_without_cabinets_is_left_out_with_a_reason() -> None:
     groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))), ROOM)
     assert groups == []
     assert [(piece.category, reason) for piece, reason in left_out] == [
-        ("countertop", "no base cabinets are left to carry it")
+        ("countertop", "no base cabinet of counter height is left to carry it")
     ]
 
 

@@ -137,4 +137,5 @@ def export(
         prepare_output("factory export", out, card)
         write_whole(out, data)
         write_whole(card, dataset_card(found, out.name, data).encode("utf-8"))
-    say(f"{len(found.records)} tasks: {out}, card: {card}")
+    count = len(found.records)
+    say(f"{count} task{'s' * (count != 1)}: {out}, card: {card}")

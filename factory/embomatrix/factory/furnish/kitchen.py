@@ -118,7 +118,7 @@ def _counters(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
     if left and not groups and pool.room_type != "kitchen":
         # A worktop on side panels, as in a washroom or a copy room.
         groups.append(worktop(left.pop(0)))
-    left_out += [(slab, "no base cabinets are left to carry it") for slab in left]
+    left_out += [(slab, "no base cabinet of counter height is left to carry it") for slab in left]
     groups += [
         FurnitureGroup((Member(bar),), Style.RUN, 0.0)
         for bar in pool.take(p for p in pool.of("bar") if pool.room_type == "kitchen" and p.size_m[0] <= 0.75)
