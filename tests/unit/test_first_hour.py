@@ -37,6 +37,8 @@ def test_gain_is_paired_by_task_and_the_worst_seed_counts() -> None:
     assert figures["demo_gain_lower_min"].value < 0.25 < seed(0, 12).gain.low
     assert figures["demo_success after GRPO"].value == pytest.approx(100 * (12 + 7) / 40)
     assert figures["demo_minutes"].value == 10.0
+    low, high = figures["demo_gain_low"].value, figures["demo_gain_high"].value
+    assert low < figures["demo_gain"].value < high
 
 
 def test_no_seed_has_no_figures() -> None:
@@ -75,8 +77,9 @@ def test_repeated_seed_is_held_against_the_record() -> None:
     assert "platform is another" in comparison(recorded, replace(recorded, curve="other", platform="arm64"))
 
 
-def test_digest_of_a_curve_leaves_out_its_times() -> None:
-    row = {"step": 1, "reward": 0.25}
-    one, other = {**row, "seconds": 1.0, "spent_s": {"sampling": 1.0}}, {**row, "seconds": 2.0}
+def test_digest_of_a_curve_is_about_what_the_policy_did():
+    row = {"step": 1, "reward": 0.25, "success": 0.5, "gradient_norm": 0.125}
+    one, other = {**row, "seconds": 1.0, "spent_s": {"sampling": 1.0}}, {**row, "seconds": 2.0, "kl": None}
     assert curve_digest([one]) == curve_digest([other])
-    assert curve_digest([one]) != curve_digest([{**one, "reward": 0.5}])
+    for name in row:
+        assert curve_digest([one]) != curve_digest([{**one, name: 0.75}])

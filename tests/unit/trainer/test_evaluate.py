@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, TaskScore, improvement
-from embomatrix.trainer.evaluation.intervals import bootstrap
+from embomatrix.trainer.evaluation.intervals import bootstrap, over_seeds_and_tasks
 
 
 def scored(successes, samples=10, prefix="t", category="pick_and_place"):
@@ -39,6 +39,27 @@ def test_paired_difference_is_significant_within_both_intervals():
     change = improvement(before, after)
     assert change.value == pytest.approx(0.1)
     assert change.low > 0
+
+
+def test_interval_over_seeds_and_tasks_is_wider_than_over_tasks_if_seeds_differ():
+    rng = np.random.default_rng(0)
+    tasks = rng.normal(0, 0.3, size=100)
+    alike = [{f"t{at}": value for at, value in enumerate(tasks)} for _ in range(5)]
+    apart = [
+        {name: value + shift for name, value in alike[0].items()} for shift in (-0.2, -0.1, 0.0, 0.1, 0.2)
+    ]
+    one, both = over_seeds_and_tasks(alike), over_seeds_and_tasks(apart)
+    expected = bootstrap(list(tasks))
+    assert one.value == pytest.approx(expected.value) == both.value
+    assert one.high - one.low == pytest.approx(expected.high - expected.low, rel=0.1)
+    assert both.high - both.low > 1.5 * (one.high - one.low)
+
+
+def test_only_tasks_that_all_seeds_know_count():
+    found = over_seeds_and_tasks([{"a": 1.0, "b": 0.0}, {"a": 1.0, "b": math.nan, "c": 0.0}])
+    assert (found.value, found.low, found.high) == (1.0, 1.0, 1.0)
+    assert math.isnan(over_seeds_and_tasks([]).value)
+    assert math.isnan(over_seeds_and_tasks([{"a": 1.0}, {"b": 1.0}]).value)
 
 
 @pytest.mark.parametrize("tasks", [1, 2, 20, 200])

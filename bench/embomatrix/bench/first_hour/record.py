@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure, Interval
-from embomatrix.trainer.evaluation.intervals import paired_difference
+from embomatrix.trainer.evaluation.intervals import over_seeds_and_tasks, paired_difference
 from embomatrix.world.whole_file import write_whole
 
 RECORD: Final = Path(__file__).parents[1] / "data" / "first_hour.json"
@@ -51,6 +51,15 @@ class SeedRun:
         """Success with GRPO minus success with continued imitation, paired by task, with its 95 % interval over tasks."""
         return paired_difference(self.continued.rates, self.trained.rates)
 
+    @property
+    def gains(self) -> Mapping[str, float]:
+        """The same difference of each task."""
+        return {
+            task: rate - self.continued.rates[task]
+            for task, rate in self.trained.rates.items()
+            if task in self.continued.rates
+        }
+
 
 def add_to_record(path: Path, seeds: Sequence[SeedRun]) -> Sequence[SeedRun]:
     """Add seeds to those that a file holds of the same tasks, and return all in their order. Raise BenchError and OSError."""
@@ -76,13 +85,17 @@ def read_record(path: Path = RECORD) -> tuple[SeedRun, ...]:
 
 
 def figures_of(seeds: Sequence[SeedRun]) -> tuple[Figure, ...]:
-    """Return the smallest lower bound of the gain, success of each arm, and the longest time. Raise BenchError for none."""
+    """Return the gain with its interval over seeds and tasks, success of each arm, and the longest time.
+
+    ``demo_gain_lower_min`` is the smallest lower bound of one seed's interval over tasks. Raise BenchError for no seed.
+    """
     if not seeds:
         raise BenchError(
             "no seed of the demo has run: expected at least one; run `embomatrix bench first-hour`"
         )
     count = len(seeds)
     tasks = len(seeds[0].trained.rates)
+    gain = over_seeds_and_tasks([seed.gains for seed in seeds])
 
     def success(name: str, arms: Sequence[Mapping[str, float]]) -> Figure:
         rates = [rate for arm in arms for rate in arm.values()]
@@ -94,7 +107,9 @@ def figures_of(seeds: Sequence[SeedRun]) -> tuple[Figure, ...]:
         Figure(
             "demo_gain_lower_min", min(seed.gain.low for seed in seeds), "", Better.HIGHER, count, LEAST_GAIN
         ),
-        Figure("demo_gain", sum(seed.gain.value for seed in seeds) / count, "", Better.NEITHER, count),
+        Figure("demo_gain", gain.value, "", Better.NEITHER, count),
+        Figure("demo_gain_low", gain.low, "", Better.NEITHER, count),
+        Figure("demo_gain_high", gain.high, "", Better.NEITHER, count),
         success("after imitation", [seed.imitated for seed in seeds]),
         success("imitation continued", [seed.continued.rates for seed in seeds]),
         success("after GRPO", [seed.trained.rates for seed in seeds]),

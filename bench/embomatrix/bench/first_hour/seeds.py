@@ -29,8 +29,8 @@ OnStep = Callable[[str], None]
 
 COST: Final = "cost.json"
 LOG: Final = "log.txt"
-TIMES: Final = frozenset({"seconds", "spent_s"})
-"""Figures of a step that no other run repeats."""
+CURVE: Final = ("step", "reward", "success", "gradient_norm")
+"""Figures of a step that tell two runs apart. Others may be added or renamed, and times never repeat."""
 
 
 def run_seeds(
@@ -85,8 +85,8 @@ def platform_here() -> str:
 
 
 def curve_digest(metrics: list[dict[str, Any]]) -> str:
-    """Digest of the figures of all steps without their times."""
-    rows = [{name: value for name, value in row.items() if name not in TIMES} for row in metrics]
+    """Digest of the ``CURVE`` of all steps."""
+    rows = [{name: row[name] for name in CURVE} for row in metrics]
     return hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -45,6 +45,24 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
     return Interval(float(known.mean()), float(low), float(high))
 
 
+def over_seeds_and_tasks(rows: Sequence[Mapping[str, float]], seed: int = 0) -> Interval:
+    """Mean over seeds and tasks, with an interval over both. ``rows`` has the tasks' values for each seed.
+
+    Pigeonhole bootstrap, Owen 2007 (*The pigeonhole bootstrap*): seeds and tasks are each drawn anew, because the values of a
+    seed share its chance, and those of a task its difficulty. Only tasks that all seeds know count.
+    """
+    tasks = sorted(set.intersection(*(set(row) for row in rows))) if rows else []
+    values = np.array([[row[task] for task in tasks] for row in rows])  # (seeds, tasks)
+    known = values[:, ~np.isnan(values).any(axis=0)] if tasks else values.reshape(len(rows), 0)
+    if not known.size:
+        return NOTHING
+    draws = np.random.default_rng(seed)
+    drawn = [draws.multinomial(size, np.full(size, 1 / size), RESAMPLES) for size in known.shape]  # counts
+    means = np.einsum("rs,st,rt->r", drawn[0], known, drawn[1], optimize=True) / known.size
+    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Interval(float(known.mean()), float(low), float(high))
+
+
 def paired_difference(before: Mapping[str, float], after: Mapping[str, float]) -> Interval:
     """Mean of after minus before over the tasks in both. NaN rates are left out."""
     return mean_difference([rate - before[task] for task, rate in after.items() if task in before])
