@@ -187,7 +187,7 @@ def first_hour(
     A seed takes about half an hour on two cores.
     """
     from embomatrix.bench.first_hour.record import add_to_record, comparison, figures_of, read_record
-    from embomatrix.bench.first_hour.seeds import run_seeds
+    from embomatrix.bench.first_hour.seeds import run_seed
     from embomatrix.bench.first_hour.wheel import measure_wheel
 
     given = {"steps": steps, "imitate-steps": imitate_steps}
@@ -196,7 +196,7 @@ def first_hour(
     notes: list[str] = []
 
     def measure(on_step: OnStep) -> Sequence[Figure]:
-        runs = run_seeds(range(first, first + seeds), out, budget, on_step)
+        runs = [run_seed(seed, out, budget, on_step) for seed in range(first, first + seeds)]
         notes.extend(comparison(known[run.seed], run) for run in runs if run.seed in known and not budget)
         told = runs if record is None else add_to_record(record, runs)
         figures = list(figures_of(told)) if told else []

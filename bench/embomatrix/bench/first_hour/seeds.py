@@ -10,8 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,25 +32,14 @@ CURVE: Final = ("step", "reward", "success", "gradient_norm")
 """Figures of a step that tell two runs apart. Others may be added or renamed, and times never repeat."""
 
 
-def run_seeds(
-    seeds: Sequence[int], folder: Path, options: Mapping[str, int], on_step: OnStep
-) -> Sequence[SeedRun]:
-    """Run both arms of each seed, or read those that have finished. ``options`` are budgets for `embomatrix demo`.
+def run_seed(seed: int, folder: Path, options: Mapping[str, int], on_step: OnStep) -> SeedRun:
+    """Run both arms of a seed, or read those that have finished. ``options`` are budgets for `embomatrix demo`.
 
-    Imitation goes on for as many steps as take the time of GRPO. Runs with GRPO have the machine for themselves, because their
-    time is measured. Imitation takes one core, so these runs share the machine. Raise BenchError if a run fails.
+    Imitation goes on for as many steps as take the time of GRPO. Raise BenchError if a run fails.
     """
-    trained = [_arm(folder / f"seed-{seed}-grpo", seed, options, on_step) for seed in seeds]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        arms = [
-            pool.submit(_arm, folder / f"seed-{seed}-imitation", seed, _as_long(arm, options), on_step)
-            for seed, arm in zip(seeds, trained, strict=True)
-        ]
-        try:
-            continued = [arm.result() for arm in arms]
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return [_read_seed(*each) for each in zip(seeds, trained, continued, strict=True)]
+    trained = _arm(folder / f"seed-{seed}-grpo", seed, options, on_step)
+    continued = _arm(folder / f"seed-{seed}-imitation", seed, _as_long(trained, options), on_step)
+    return _read_seed(seed, trained, continued)
 
 
 def _as_long(trained: Path, options: Mapping[str, int]) -> Mapping[str, int]:
@@ -108,7 +96,7 @@ def _arm(out: Path, seed: int, options: Mapping[str, int], on_step: OnStep) -> P
     with log.open("wb") as file:
         command = [sys.executable, "-m", "embomatrix.cli", "demo", f"--seed={seed}", *where, *given]
         with subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT) as started:
-            # Tells what this run and its processes used, whatever runs beside it.
+            # Tells what this run and its processes used.
             _, status, used = os.wait4(started.pid, 0)
             started.returncode = os.waitstatus_to_exitcode(status)
     if started.returncode or not (out / OUTCOME).exists():
