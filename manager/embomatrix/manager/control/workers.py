@@ -67,7 +67,7 @@ class WorkerRecord:
     warm: frozenset[str] = frozenset()
     """Scenes that it may get leases of. Written by ``WorkerPool.set_warm`` only."""
     held: dict[str, LeaseRecord] = field(default_factory=dict)
-    """In order of grant; the first ``slots`` run, the others are queued behind them."""
+    """Leases in order of grant; the first ``slots`` run, the others are queued behind them."""
     rendering: int = 0
     """Number of leases in ``held`` that render; at most ``render_slots``."""
     log_lag: float = 0.0

@@ -52,7 +52,7 @@ class SampledChunk:
     reference: Tensor | None = None
     old_logprobs: Tensor | None = None
     states: AnswerStates | None = None
-    """In episodes with step advantages: the states in which the policy answered."""
+    """States in which the policy answered, in episodes with step advantages."""
     waited_s: float = 0.0
     """Seconds of sampling in which the trainer's own process waited for the cluster: in episodes."""
 

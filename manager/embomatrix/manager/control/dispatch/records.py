@@ -56,7 +56,7 @@ class RolloutRecord:
     attempts: int = 0
     """Leases that started and brought no result."""
     leases: list[LeaseRecord] = field(default_factory=list)
-    """At most one live lease, or two on different workers if ``hedged``. Empty unless ``phase`` is LEASED."""
+    """Live leases: at most one, or two on different workers if ``hedged``. Empty unless ``phase`` is LEASED."""
     hedged: bool = False
     out_of_memory: bool = False
     """An attempt ran out of memory: the rollout is never hedged."""

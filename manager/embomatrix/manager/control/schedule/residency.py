@@ -29,7 +29,7 @@ class WorkerResidency:
 
     worker: WorkerRecord
     residents: dict[str, Resident] = field(default_factory=dict)
-    """From the most to the least recently used."""
+    """Scenes from the most to the least recently used."""
     warm_since_s: dict[str, float] = field(default_factory=dict)
     loading_since_s: dict[str, float] = field(default_factory=dict)
     failed_s: dict[str, float] = field(default_factory=dict)
