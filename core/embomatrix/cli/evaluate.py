@@ -19,15 +19,15 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from embomatrix.cli.evaluation_settings import Cluster, EvalSettings, Exam, world_exam
-from embomatrix.cli.evaluation_subjects import (
+from embomatrix.cli.evaluated_models import (
     MAX_TOKENS,
-    Subject,
-    endpoint_subject,
+    EvaluatedModel,
+    evaluated_endpoint,
+    evaluated_policy,
     playing_baseline,
-    policy_subject,
     written_baseline,
 )
+from embomatrix.cli.evaluation_settings import Cluster, EvalSettings, Exam, world_exam
 from embomatrix.envs.rules import Visibility
 from embomatrix.host.failure import INTERRUPTED, fail, unwritable
 from embomatrix.host.own_files import is_own, prepare_output
@@ -80,7 +80,7 @@ def _option(panel: str, *names: str, **options: Any) -> Any:
     return typer.Option(*names, rich_help_panel=panel, show_default=False, **options)
 
 
-_SUBJECT: Final = "Subject (exactly one of --model, --endpoint, --baseline, --answers)"
+_EVALUATED: Final = "What is evaluated (exactly one of --model, --endpoint, --baseline, --answers)"
 _BENCH: Final = "Benchmark"
 _EXECUTION: Final = "Execution"
 _OUTPUT: Final = "Output"
@@ -89,24 +89,24 @@ _OUTPUT: Final = "Output"
 def evaluate(
     context: typer.Context,
     model: Annotated[
-        str, _option(_SUBJECT, help="Checkpoint, or a Hugging Face model by name or folder.")
+        str, _option(_EVALUATED, help="Checkpoint, or a Hugging Face model by name or folder.")
     ] = "",
     endpoint: Annotated[
-        str, _option(_SUBJECT, help="URL of an OpenAI-compatible endpoint, before /chat/completions.")
+        str, _option(_EVALUATED, help="URL of an OpenAI-compatible endpoint, before /chat/completions.")
     ] = "",
-    model_name: Annotated[str, _option(_SUBJECT, help="Model name at the endpoint.")] = "",
+    model_name: Annotated[str, _option(_EVALUATED, help="Model name at the endpoint.")] = "",
     key: Annotated[
-        str, _option(_SUBJECT, "--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="API key of the endpoint.")
+        str, _option(_EVALUATED, "--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="API key of the endpoint.")
     ] = "",
-    baseline: Annotated[BaselineName | None, _option(_SUBJECT, help="Baseline without a model.")] = None,
+    baseline: Annotated[BaselineName | None, _option(_EVALUATED, help="Baseline without a model.")] = None,
     training: Annotated[
         Path | None,
         _option(
-            _SUBJECT,
+            _EVALUATED,
             help="Dataset whose training tasks the baselines template and nearest learn from. Default: that of --bench.",
         ),
     ] = None,
-    answers: Annotated[Path | None, _option(_SUBJECT, help="Stored answers to judge again.")] = None,
+    answers: Annotated[Path | None, _option(_EVALUATED, help="Stored answers to judge again.")] = None,
     bench: Annotated[
         str,
         _option(
@@ -173,15 +173,17 @@ def evaluate(
             _check_reports(folder)
             rows = [read_row(path, exam.digest) for path in beside or []]
             if model:
-                subject = policy_subject(exam, model, settings)
+                evaluated = evaluated_policy(exam, model, settings)
             elif baseline is None:
-                subject = endpoint_subject(exam, endpoint, model_name, key, settings, folder)
+                evaluated = evaluated_endpoint(exam, endpoint, model_name, key, settings, folder)
             elif isinstance(exam, EpisodeExam):
-                subject = playing_baseline(exam, baseline, settings.seed)
+                evaluated = playing_baseline(exam, baseline, settings.seed)
             else:
-                subject = Subject(functools.partial(ask_script, written_baseline(exam, baseline, training)))
+                evaluated = EvaluatedModel(
+                    functools.partial(ask_script, written_baseline(exam, baseline, training))
+                )
             _prepare_reports(folder)
-            setup, given = _ask(exam, subject, label, settings, folder)
+            setup, given = _ask(exam, evaluated, label, settings, folder)
             _judge(exam, setup, given, folder, rows)
 
 
@@ -239,33 +241,33 @@ def _exam(
     yield opened(find_benchmark(name, split, limit, profile))
 
 
-def _show_limits(exam: Exam, subject: Subject) -> None:
-    """Print the share of tasks that the subject can't express. EAI's own prompts have no oracle plans."""
-    if subject.ruler is None or isinstance(exam, NativeExam):
+def _show_limits(exam: Exam, evaluated: EvaluatedModel) -> None:
+    """Print the share of tasks that the model can't express. EAI's own prompts have no oracle plans."""
+    if evaluated.counter is None or isinstance(exam, NativeExam):
         return
-    limits = Limits(subject.rows, subject.max_tokens)
+    limits = Limits(evaluated.rows, evaluated.max_tokens)
     tasks = tuple(exam.bench.tasks.values())
-    found = expressibility(tasks, limits, subject.ruler, refused=exam.by_rule)
+    found = expressibility(tasks, limits, evaluated.counter, refused=exam.by_rule)
     console.print(sentence_about(found, f"tasks of {exam.name}", limits, MAX_TOKENS))
 
 
 def _ask(
-    exam: Exam, subject: Subject, label: str, settings: EvalSettings, folder: Path
+    exam: Exam, evaluated: EvaluatedModel, label: str, settings: EvalSettings, folder: Path
 ) -> tuple[EvaluationSetup, tuple[Answer, ...]]:
     """Collect the missing answers."""
-    _show_limits(exam, subject)
-    questions = exam.questions(subject.codec, subject.rows)
+    _show_limits(exam, evaluated)
+    questions = exam.questions(evaluated.codec, evaluated.rows)
     setup = EvaluationSetup(
         bench=exam.name,
         bench_digest=exam.digest,
         split=exam.split,
         tasks=len(exam.task_ids),
         model=label,
-        codec=EAI_CODEC if isinstance(exam, NativeExam) else subject.codec.value,
-        rows=subject.rows,
+        codec=EAI_CODEC if isinstance(exam, NativeExam) else evaluated.codec.value,
+        rows=evaluated.rows,
         samples=settings.samples,
         temperature=settings.temperature,
-        max_tokens=subject.max_tokens,
+        max_tokens=evaluated.max_tokens,
         seed=settings.seed,
         questions=questions_digest(questions),
         by_rule=exam.by_rule,
@@ -277,7 +279,7 @@ def _ask(
         if len(sheet):
             console.print(f"{len(sheet)} answers are already stored")
         with _bar("answers") as on_progress:
-            subject.ask(questions, sheet, on_progress)
+            evaluated.ask(questions, sheet, on_progress)
         given = sheet.ordered(exam.task_ids)
     console.print(f"{len(given)} answers in {time.monotonic() - began_s:.1f} s: {folder / FILE}")
     return setup, given

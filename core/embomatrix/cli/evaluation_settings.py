@@ -18,7 +18,7 @@ from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.trainer.eai.exam import NativeExam
 from embomatrix.trainer.evaluation.answers import MOST_SAMPLES
 from embomatrix.trainer.evaluation.benchmark import Benchmark
-from embomatrix.trainer.evaluation.episodes import EpisodeExam, EpisodeStage
+from embomatrix.trainer.evaluation.episodes import EpisodeExam, EpisodeRunner
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.world.task import Profile
 
@@ -103,5 +103,5 @@ class Cluster:
 
 def world_exam(cluster: Cluster, bench: Benchmark, *, interactive: bool) -> WorldExam | EpisodeExam:
     if interactive:
-        return EpisodeExam(bench, EpisodeStage(bench, functools.partial(cluster.simulation, bench)))
+        return EpisodeExam(bench, EpisodeRunner(bench, functools.partial(cluster.simulation, bench)))
     return WorldExam(bench, cluster.executor(bench))

@@ -254,13 +254,15 @@ def _plan_of_policy(loaded: LoadedPolicy, situation: Situation, seed: int) -> Pl
 
     from embomatrix.trainer.cluster.gateway import parse_policy_text
     from embomatrix.trainer.config.errors import TrainerError
-    from embomatrix.trainer.policy.limits import Ruler, room_for
+    from embomatrix.trainer.policy.limits import TokenCounter, room_for
 
     policy, settings = loaded.policy, loaded.settings
     try:
         asked = limited(situation, settings.prompt.rows)
         prompt = prompt_for(asked, policy.codec)
-        max_new = room_for(settings.grpo.max_new, {situation.instruction: prompt}, Ruler.of_policy(policy))
+        max_new = room_for(
+            settings.grpo.max_new, {situation.instruction: prompt}, TokenCounter.of_policy(policy)
+        )
     except TrainerError as error:
         fail(str(error))
     drawn = policy.sample([policy.encode(prompt)], 1, 0.0, max_new, torch.Generator().manual_seed(seed))

@@ -14,7 +14,7 @@ from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers, RemoteLearner, SharedTensors
 from embomatrix.trainer.learning.gradient import GradientSum
-from embomatrix.trainer.learning.learner import SamplingRule
+from embomatrix.trainer.learning.learner import SamplingParams
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
@@ -147,7 +147,7 @@ def test_a_batch_of_imitation_is_shared_and_its_gradient_is_that_of_the_whole(mo
 def test_error_in_a_remote_process_is_reported():
     settings = read_settings(None, {"processes": 2})
     policy = new_policy(settings, TASKS)
-    rule = SamplingRule.of(settings.grpo)
+    rule = SamplingParams.of(settings.grpo)
     with DataParallelWorkers.start(policy, settings) as workers:
         asked = workers.remote(1).run(lambda remote: remote.sample([(1, 2, 10**9)], 0, rule))
         with pytest.raises(TrainerError, match=r"trainer-1 failed \(IndexError.*continue with --resume"):

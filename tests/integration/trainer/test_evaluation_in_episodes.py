@@ -19,16 +19,16 @@ from embomatrix.trainer.config.settings import read_settings
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
-from embomatrix.trainer.evaluation.conversing import converse_in_episodes
 from embomatrix.trainer.evaluation.episodes import (
     EpisodeExam,
-    EpisodeStage,
-    SearchingSubject,
+    EpisodeRunner,
+    SearchingAgent,
     ask_endpoint_in_episodes,
     play_episodes,
 )
 from embomatrix.trainer.evaluation.page import evaluation_page
-from embomatrix.trainer.evaluation.replanning import ReplanningSubject, WrittenPlan
+from embomatrix.trainer.evaluation.policy_agent import converse_in_episodes
+from embomatrix.trainer.evaluation.replanning import ReplanningAgent, WrittenPlan
 from embomatrix.trainer.evaluation.table import report_of, text_report
 from embomatrix.trainer.evaluation.taxonomy import Cause
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress
@@ -72,7 +72,7 @@ def setup_of(bench, visibility="full", samples=1, calls_factor=2.0, calls_more=1
 
 
 def exam_of(bench):
-    return EpisodeExam(bench, EpisodeStage(bench, functools.partial(LocalSimulation, bench.dataset)))
+    return EpisodeExam(bench, EpisodeRunner(bench, functools.partial(LocalSimulation, bench.dataset)))
 
 
 def judged(bench, answers, setup):
@@ -145,7 +145,7 @@ def test_searching_oracle_finds_what_it_does_not_see(bench, tmp_path):
     with AnswerSheet(tmp_path / "answers.jsonl", setup) as sheet:
         play_episodes(
             exam.stage,
-            lambda task_id, sample: SearchingSubject(bench.tasks[task_id], priors),
+            lambda task_id, sample: SearchingAgent(bench.tasks[task_id], priors),
             exam.questions(Codec.LINES, 60),
             sheet,
             lambda *_: None,
@@ -200,7 +200,7 @@ def replanned(apple, folder, setup, *texts):
     with AnswerSheet(folder / "answers.jsonl", setup) as sheet:
         play_episodes(
             exam.stage,
-            lambda *_: ReplanningSubject(write),
+            lambda *_: ReplanningAgent(write),
             exam.questions(Codec.LINES, 60),
             sheet,
             lambda *_: None,

@@ -20,7 +20,7 @@ from embomatrix.trainer.policy.limits import (
     MARGIN,
     Limits,
     Obstacle,
-    Ruler,
+    TokenCounter,
     check_context,
     expressibility,
     plan_of,
@@ -69,8 +69,10 @@ def test_unset_limits_hold_every_oracle_plan_for_training(shipped, policy):
     limits = limits_of(with_limits(read_settings(None, SMALL), policy, shipped))
     lengths = [len(policy.encode_plan(plan_of(task, limits.rows, Codec.NAMES))) for task in shipped.train]
     assert max(lengths) < limits.max_new <= MARGIN * max(lengths) + 1
-    assert expressibility(shipped.train, limits, Ruler.of_policy(policy)).share == 0
-    fewer = expressibility(shipped.train, replace(limits, rows=limits.rows - 1), Ruler.of_policy(policy))
+    assert expressibility(shipped.train, limits, TokenCounter.of_policy(policy)).share == 0
+    fewer = expressibility(
+        shipped.train, replace(limits, rows=limits.rows - 1), TokenCounter.of_policy(policy)
+    )
     assert fewer.obstacles[Obstacle.ROWS] > 0
 
 
@@ -84,18 +86,18 @@ def test_given_limits_stay(shipped, policy):
 
 def test_former_limits_of_the_word_level_policy_excluded_a_third_of_the_shipped_tasks(shipped, policy):
     former = Limits(16, 72)
-    found = expressibility(shipped.train, former, Ruler.of_policy(policy))
+    found = expressibility(shipped.train, former, TokenCounter.of_policy(policy))
     assert 0.3 < found.share < 0.4
     sentence = sentence_about(found, "training tasks", former, "grpo.max_new")
     assert sentence.startswith("warning: ")
     assert f"need objects beyond prompt.rows = 16: {found.needed.rows} rows hold all" in sentence
     assert f"beyond grpo.max_new = 72 tokens: {found.needed.max_new} hold all" in sentence
-    assert expressibility(shipped.train, found.needed, Ruler.of_policy(policy)).inexpressible == 0
+    assert expressibility(shipped.train, found.needed, TokenCounter.of_policy(policy)).inexpressible == 0
 
 
 def test_sentence_is_a_warning_only_above_five_percent(shipped, policy):
     limits = replace(limits_of(with_limits(read_settings(None, SMALL), policy, shipped)), rows=24)
-    found = expressibility(shipped.heldout, limits, Ruler.of_policy(policy))
+    found = expressibility(shipped.heldout, limits, TokenCounter.of_policy(policy))
     assert 0 < found.share < 0.05
     assert sentence_about(found, "held-out tasks", limits, "grpo.max_new").startswith(
         f"{found.inexpressible} of {len(shipped.heldout)} held-out tasks ("
@@ -114,12 +116,12 @@ def test_rows_needed_is_the_smallest_limit_that_keeps_the_plan_s_objects(shipped
 def test_skills_and_words_that_a_vocabulary_lacks_are_obstacles(shipped, kitchen):
     from_kitchen = new_policy(read_settings(None, SMALL), load_tasks(kitchen))
     limits = Limits(MAX_TABLE, 400)
-    found = expressibility(shipped.train, limits, Ruler.of_policy(from_kitchen))
+    found = expressibility(shipped.train, limits, TokenCounter.of_policy(from_kitchen))
     assert found.obstacles[Obstacle.VOCABULARY] > 0
     assert set(found.obstacles) <= {Obstacle.SKILLS, Obstacle.VOCABULARY}
     assert "need words that the model can't write (" in sentence_about(found, "tasks", limits, "max_tokens")
     open_limits = Limits(MAX_TABLE, ANSWER_TOKENS)
-    refused = expressibility(shipped.train, open_limits, Ruler.of_endpoint(Codec.JSON), refused=40)
+    refused = expressibility(shipped.train, open_limits, TokenCounter.of_endpoint(Codec.JSON), refused=40)
     assert refused.obstacles == {Obstacle.SKILLS: 40}
     assert refused.share == 40 / 2040
 
@@ -127,7 +129,7 @@ def test_skills_and_words_that_a_vocabulary_lacks_are_obstacles(shipped, kitchen
 def test_tasks_without_oracle_plans_are_left_out_and_keep_the_settings(shipped, policy):
     bare = replace(shipped, train=tuple(replace(task, oracle=()) for task in shipped.train))
     assert with_limits(read_settings(None, SMALL), policy, bare) == read_settings(None, SMALL)
-    found = expressibility(bare.train, Limits(1, 1), Ruler.of_policy(policy))
+    found = expressibility(bare.train, Limits(1, 1), TokenCounter.of_policy(policy))
     assert found.tasks == 0
     assert "no oracle plans" in sentence_about(found, "training tasks", Limits(1, 1), "grpo.max_new")
 
@@ -180,28 +182,28 @@ def test_prompt_beyond_the_model_s_context_is_refused_before_the_run(kitchen, tm
 
 
 def test_word_level_policy_has_room_for_its_longest_answer(shipped, policy):
-    prompts, ruler = prompts_of(shipped.heldout, MAX_TABLE, Codec.NAMES), Ruler.of_policy(policy)
-    room = room_for(ANSWER_TOKENS, prompts, ruler)
+    prompts, counter = prompts_of(shipped.heldout, MAX_TABLE, Codec.NAMES), TokenCounter.of_policy(policy)
+    room = room_for(ANSWER_TOKENS, prompts, counter)
     assert room < ANSWER_TOKENS
-    check_context(prompts, room, ruler, "max_tokens")
+    check_context(prompts, room, counter, "max_tokens")
     with pytest.raises(TrainerError, match="and max_tokens is"):
-        check_context(prompts, room + 1, ruler, "max_tokens")
+        check_context(prompts, room + 1, counter, "max_tokens")
 
 
 @pytest.mark.hf
 def test_smollm2_can_write_the_shipped_plans_within_the_default_of_every_model(shipped, smollm2):
-    ruler = replace(Ruler.of_policy(smollm2), codec=Codec.JSON)
+    counter = replace(TokenCounter.of_policy(smollm2), codec=Codec.JSON)
     limits = Limits(MAX_TABLE, ANSWER_TOKENS)
     for tasks in (shipped.train, shipped.heldout):
-        assert expressibility(tasks, limits, ruler).inexpressible == 0
-    former = expressibility(shipped.train, Limits(28, 96), ruler)
+        assert expressibility(tasks, limits, counter).inexpressible == 0
+    former = expressibility(shipped.train, Limits(28, 96), counter)
     assert former.share > 0.5
     assert Obstacle.LENGTH in former.obstacles
 
 
 @pytest.mark.hf
 def test_estimate_for_endpoints_is_not_below_smollm2_s_tokens(shipped, smollm2):
-    estimate = Ruler.of_endpoint(Codec.JSON)
+    estimate = TokenCounter.of_endpoint(Codec.JSON)
     for task in shipped.heldout:
         text = plan_of(task, MAX_TABLE, Codec.JSON)
         assert estimate.plan_tokens(text) >= len(smollm2.encode_plan(text))

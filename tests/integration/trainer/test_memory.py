@@ -14,7 +14,7 @@ from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, LoraSett
 from embomatrix.trainer.data.tasks import load_tasks
 from embomatrix.trainer.policy.footprint import LanguageModelFootprint, Precision, WordLevelFootprint
 from embomatrix.trainer.policy.hf import HfPolicy
-from embomatrix.trainer.policy.limits import Ruler, with_limits
+from embomatrix.trainer.policy.limits import TokenCounter, with_limits
 from embomatrix.trainer.policy.loading import new_policy
 from embomatrix.trainer.policy.memory_plan import GB, Phase
 from embomatrix.trainer.policy.model_shape import language_model_shape
@@ -83,7 +83,7 @@ def test_word_level_plan_measures_texts_as_the_policy_does(kitchen):
     tasks = load_tasks(kitchen)
     policy = new_policy(found.settings, tasks)
     assert found.settings == with_limits(read_settings(None, {**CPU, "model": "tiny"}), policy, tasks)
-    assert found.lengths == lengths_of(tasks, found.settings, Ruler.of_policy(policy))
+    assert found.lengths == lengths_of(tasks, found.settings, TokenCounter.of_policy(policy))
     text = memory_text(found, 80.0)
     assert text.endswith("It fits in 72.00 GB, the usable share of 80 GB.")
     assert "estimated" not in text

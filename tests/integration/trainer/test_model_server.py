@@ -17,7 +17,7 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
-from embomatrix.trainer.learning.learner import SamplingRule
+from embomatrix.trainer.learning.learner import SamplingParams
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.logging.display import LineDisplay
 from embomatrix.trainer.logging.recorder import read_metrics
@@ -87,7 +87,7 @@ def test_learnt_tokens_are_the_sampled_ones_and_their_log_probabilities_are_the_
         start = started(model_folder, url, {"sampler.kind": kind, **changes})
         prompts = [start.prompt_builder.plain(task).tokens for task in TASKS.train[:2]]
         with start.model_server(tmp_path) as sampler:
-            samples = sampler.begin(prompts, 5, SamplingRule(3, 0.8, 8))()
+            samples = sampler.begin(prompts, 5, SamplingParams(3, 0.8, 8))()
         body, answer = served.bodies(path)[-1], served.calls[-1 if changes == {} else -2][2]
     rows = [row[own].tolist() for row, own in zip(samples.tokens, samples.mask, strict=True)]
     if kind == VLLM:
@@ -287,7 +287,7 @@ def test_weights_that_another_program_loads_end_the_run(model_folder, tmp_path):
             with pytest.raises(
                 TrainerError, match=r"sampled from the weights .*: give this run a server of its own"
             ):
-                sampler.begin([(2, 3)], 0, SamplingRule(2, 1.0, 4))()
+                sampler.begin([(2, 3)], 0, SamplingParams(2, 1.0, 4))()
 
 
 def test_end_of_a_run_does_not_wait_for_unfinished_plans(model_folder, tmp_path):
@@ -296,7 +296,7 @@ def test_end_of_a_run_does_not_wait_for_unfinished_plans(model_folder, tmp_path)
         start = started(model_folder, url, ADAPTERS)
         with start.model_server(tmp_path) as sampler:
             served.hold.clear()
-            wait = sampler.begin([(2, 3)], 0, SamplingRule(2, 1.0, 4))
+            wait = sampler.begin([(2, 3)], 0, SamplingParams(2, 1.0, 4))
             began_s = time.monotonic()
         assert time.monotonic() - began_s < 10
         with pytest.raises(CancelledError):

@@ -5,7 +5,7 @@ from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.config.settings import GrpoSettings
-from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingRule
+from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingParams
 from embomatrix.trainer.learning.objective import LossTotals
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.tiny import TinyPolicy
@@ -33,7 +33,7 @@ def learnt(entropy_coef):
     settings = GrpoSettings(group=PLANS // 2, max_new=6, kl_coef=0.0, entropy_coef=entropy_coef)
     learner = Learner(policy, policy.frozen_copy(), settings)
     prompts = [policy.encode(prompt_for(task.situation, Codec.NAMES)) for task in TASKS.train]
-    samples = learner.sample(prompts, 0, SamplingRule.of(settings))
+    samples = learner.sample(prompts, 0, SamplingParams.of(settings))
     microbatch = Microbatch(
         prompts=prompts,
         tokens=samples.tokens,

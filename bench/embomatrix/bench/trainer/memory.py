@@ -14,7 +14,7 @@ from embomatrix.trainer.data.variation import Variation
 from embomatrix.trainer.grpo.sampling import Sampler
 from embomatrix.trainer.grpo.update import Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
-from embomatrix.trainer.learning.learner import Learner, SamplingRule
+from embomatrix.trainer.learning.learner import Learner, SamplingParams
 from embomatrix.trainer.lifecycle.stopwatch import Stopwatch
 from embomatrix.trainer.policy.footprint import Footprint, LanguageModelFootprint, Precision
 from embomatrix.trainer.policy.memory_plan import Lengths, Phase, plan_memory
@@ -32,7 +32,7 @@ class LongPlanLearner(Learner):
     longest_prompt = 0
     longest_plan = 0
 
-    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingParams) -> Samples:
         drawn = super().sample(prompts, seed, rule)
         self.longest_prompt = max(self.longest_prompt, *map(len, prompts))
         self.longest_plan = max(self.longest_plan, drawn.tokens.shape[1])

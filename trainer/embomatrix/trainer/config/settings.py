@@ -125,7 +125,7 @@ class TinySettings(_Frozen):
     inner: int = Field(default=384, ge=16)
 
 
-class EpisodesTable(_Frozen):
+class EpisodeSettings(_Frozen):
     """Episodes instead of whole plans: the policy answers call by call, and is told what happened."""
 
     visibility: Visibility | None = None
@@ -347,7 +347,7 @@ class GrpoSettings(_Frozen):
         return self.zero_variance is ZeroVariance.KEEP and has_terms and not self.reserve
 
 
-class RewardTable(_Frozen):
+class RewardCoefficients(_Frozen):
     """Coefficients of the reward's tiers, which the cluster applies to this run's plans. 0 leaves a tier out."""
 
     unparsable: float = PAPER.unparsable
@@ -409,10 +409,10 @@ class TrainSettings(_Frozen):
     lora: LoraSettings = LoraSettings()
     sampler: SamplerSettings = SamplerSettings()
     prompt: PromptSettings = PromptSettings()
-    episodes: EpisodesTable = EpisodesTable()
+    episodes: EpisodeSettings = EpisodeSettings()
     imitation: ImitationSettings = ImitationSettings()
     grpo: GrpoSettings = GrpoSettings()
-    reward: RewardTable = RewardTable()
+    reward: RewardCoefficients = RewardCoefficients()
     evaluation: EvaluationSettings = EvaluationSettings()
 
     @field_validator("device")

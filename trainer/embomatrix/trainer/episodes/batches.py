@@ -24,7 +24,7 @@ from embomatrix.trainer.learning.data_parallel import RemoteLearner
 if TYPE_CHECKING:
     from embomatrix.trainer.cluster.gateway import PlanOutcome
     from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
-    from embomatrix.trainer.learning.learner import Learner, SamplingRule
+    from embomatrix.trainer.learning.learner import Learner, SamplingParams
     from embomatrix.trainer.policy.protocol import Policy, Samples, Tokens
 
 T = TypeVar("T")
@@ -75,7 +75,7 @@ def play_batches(
     workers: DataParallelWorkers,
     client: EpisodeClient,
     policy: Policy,
-    rule: SamplingRule,
+    rule: SamplingParams,
 ) -> list[PlayedBatch]:
     """Play batches on the learners that own them. Raises TrainerError if the cluster or a process failed.
 
@@ -113,7 +113,7 @@ class _RunningBatch:
         learner: Learner | RemoteLearner,
         client: EpisodeClient,
         policy: Policy,
-        rule: SamplingRule,
+        rule: SamplingParams,
     ) -> None:
         self._batch, self._rule = batch, rule
         self._learner, self._client, self._policy = learner, client, policy

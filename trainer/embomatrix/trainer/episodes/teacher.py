@@ -30,7 +30,7 @@ from embomatrix.trainer.episodes.oracle import (
     successful,
     write_episodes,
 )
-from embomatrix.trainer.learning.learner import SamplingRule
+from embomatrix.trainer.learning.learner import SamplingParams
 
 if TYPE_CHECKING:
     from embomatrix.trainer.config.settings import TrainSettings
@@ -55,14 +55,14 @@ class TeachingRules:
     rounds: int
     episodes: int
     terms: EpisodeTerms
-    sampling: SamplingRule
+    sampling: SamplingParams
     seed: int
 
     @staticmethod
     def of(settings: TrainSettings, terms: EpisodeTerms) -> TeachingRules:
         """Return the rules that the settings of a run ask for."""
         table, grpo = settings.episodes, settings.grpo
-        sampling = SamplingRule(1, grpo.temperature, table.answer_tokens)
+        sampling = SamplingParams(1, grpo.temperature, table.answer_tokens)
         return TeachingRules(table.teacher_rounds, table.teacher_episodes, terms, sampling, settings.seed)
 
     def due(self, share: float) -> int:

@@ -10,7 +10,7 @@ from embomatrix.skills.syntax import MAX_STEPS
 
 if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.config.settings import EpisodesTable
+    from embomatrix.trainer.config.settings import EpisodeSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class EpisodeTerms:
     step_discount: float = 1.0
 
     @staticmethod
-    def of(settings: EpisodesTable) -> EpisodeTerms | None:
+    def of(settings: EpisodeSettings) -> EpisodeTerms | None:
         """Terms of a run's episodes, None if the policy writes whole plans."""
         if settings.visibility is None:
             return None

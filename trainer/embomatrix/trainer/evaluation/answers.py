@@ -34,7 +34,7 @@ _Natural = Annotated[int, Field(ge=0)]
 
 @dataclass(frozen=True, slots=True, config=_STRICT)
 class EvaluationSetup:
-    """Question and subject of an evaluation. Equal setups ask equal questions.
+    """Questions of an evaluation, and who answers them. Equal setups ask equal questions.
 
     ``bench_digest`` identifies the tasks. ``questions`` is a hash of all prompts, empty for baselines, which get no prompt.
     ``rows`` is the maximum number of table rows in a prompt. ``seed`` also seeds the execution. ``by_rule`` counts the tasks

@@ -1,4 +1,4 @@
-"""Evaluation in episodes: a subject answers call by call and is told what happened.
+"""Evaluation in episodes: an agent answers call by call and observes what happened.
 
 The answer sheet keeps all answers of an episode as one, a JSON list of texts, so an episode can be judged again: equal answers
 lead to equal observations and to the same end.
@@ -50,7 +50,7 @@ TURNS_FILE: Final = "turns.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class AgentReply:
     """One answer within an episode. Token counts are 0 if unknown."""
 
     text: str
@@ -59,12 +59,12 @@ class Said:
     completion_tokens: int = 0
 
 
-class EpisodeSubject(Protocol):
+class EpisodeAgent(Protocol):
     """Anything that plays one episode."""
 
     async def answer(
         self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
-    ) -> Said:
+    ) -> AgentReply:
         """Return the next answer.
 
         ``observations`` are the texts so far, the task first, and ``answers`` the answers to them. A model must not look at the
@@ -77,7 +77,7 @@ Play = Callable[[str, int, Prompt, EpisodePlayer], Awaitable[None]]
 """Plays one episode: gets its task, its sample, the opening prompt and the player."""
 
 
-class EpisodeStage:
+class EpisodeRunner:
     """Plays episodes of a benchmark's tasks. ``simulate`` returns where they are executed."""
 
     def __init__(self, bench: Benchmark, simulate: Callable[[], Simulation]) -> None:
@@ -143,14 +143,14 @@ def _terms_of(setup: EvaluationSetup) -> EpisodeTerms:
 
 
 def play_episodes(
-    stage: EpisodeStage,
-    subject_of: Callable[[str, int], EpisodeSubject],
+    stage: EpisodeRunner,
+    agent_of: Callable[[str, int], EpisodeAgent],
     questions: Sequence[Question],
     sheet: AnswerSheet,
     on_progress: OnProgress,
     within: Callable[[], AbstractAsyncContextManager[object]] = contextlib.nullcontext,
 ) -> None:
-    """Play the episodes that the sheet lacks, each by its own subject, and store their answers.
+    """Play the episodes that the sheet lacks, each by its own agent, and store their answers.
 
     Raises TrainerError with the number of stored episodes if a model does not answer, ClusterError and EngineError.
     """
@@ -158,12 +158,12 @@ def play_episodes(
     keys = [(question.task_id, sample) for question in questions for sample in range(sheet.setup.samples)]
 
     async def play(task_id: str, sample: int, prompt: Prompt, player: EpisodePlayer) -> None:
-        subject = subject_of(task_id, sample)
-        answers: list[Said] = []
+        agent = agent_of(task_id, sample)
+        answers: list[AgentReply] = []
         observations = [prompt.user]
         while player.end is None:
-            answer = await subject.answer(prompt.system, observations, [one.text for one in answers], player)
-            if player.end is not None:  # the subject has no room for another answer
+            answer = await agent.answer(prompt.system, observations, [one.text for one in answers], player)
+            if player.end is not None:  # the agent has no room for another answer
                 break
             answers.append(answer)
             observations.append((await player.answer(answers[-1].text)).text)
@@ -183,7 +183,7 @@ def play_episodes(
         ) from error
 
 
-class ChatSubject:
+class ChatAgent:
     """Model behind an OpenAI-compatible endpoint, asked with the whole conversation so far."""
 
     def __init__(self, model: ChatModel, setup: EvaluationSetup, task_id: str, sample: int) -> None:
@@ -193,7 +193,7 @@ class ChatSubject:
 
     async def answer(
         self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
-    ) -> Said:
+    ) -> AgentReply:
         """Ask the model. Raises LlmError."""
         turns = itertools.chain.from_iterable(
             itertools.zip_longest(
@@ -211,13 +211,13 @@ class ChatSubject:
                 seed=self._seed,
             )
         )
-        return Said(reply.text, reply.finish, reply.usage.prompt_tokens, reply.usage.completion_tokens)
+        return AgentReply(reply.text, reply.finish, reply.usage.prompt_tokens, reply.usage.completion_tokens)
 
 
 def ask_endpoint_in_episodes(
     open_endpoint: Callable[[], Endpoint],
     folder: Path,
-    stage: EpisodeStage,
+    stage: EpisodeRunner,
     questions: Sequence[Question],
     sheet: AnswerSheet,
     on_progress: OnProgress,
@@ -230,7 +230,7 @@ def ask_endpoint_in_episodes(
         raise TrainerError(str(error)) from error
     play_episodes(
         stage,
-        lambda task_id, sample: ChatSubject(model, sheet.setup, task_id, sample),
+        lambda task_id, sample: ChatAgent(model, sheet.setup, task_id, sample),
         questions,
         sheet,
         on_progress,
@@ -253,7 +253,7 @@ class _OpenedEndpoint:
         return await self._endpoint.complete(request)
 
 
-class SearchingSubject:
+class SearchingAgent:
     """Oracle: it knows what to do and with which objects, and looks for those that it has not seen."""
 
     def __init__(self, task: TrainingTask, priors: PlacePriors) -> None:
@@ -261,13 +261,13 @@ class SearchingSubject:
 
     async def answer(
         self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
-    ) -> Said:
+    ) -> AgentReply:
         """Return the script's next call."""
         last = player.steps[-1] if player.steps else None
         return _said(self._script.next_call(player.observer.situation, last))
 
 
-class PlanSubject:
+class PlanAgent:
     """Plan that is written at the start and carried out call by call, whatever happens."""
 
     def __init__(self, plan: Plan) -> None:
@@ -275,19 +275,19 @@ class PlanSubject:
 
     async def answer(
         self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
-    ) -> Said:
+    ) -> AgentReply:
         """Return the plan's next call."""
         return _said(next(self._calls, None))
 
 
-def _said(call: SkillCall | None) -> Said:
-    return Said(DONE if call is None else plan_to_lines((call,)))
+def _said(call: SkillCall | None) -> AgentReply:
+    return AgentReply(DONE if call is None else plan_to_lines((call,)))
 
 
 class EpisodeExam:
     """Benchmark of our own tasks, played in episodes."""
 
-    def __init__(self, bench: Benchmark, stage: EpisodeStage) -> None:
+    def __init__(self, bench: Benchmark, stage: EpisodeRunner) -> None:
         self.bench = bench
         self.stage = stage
         self.name, self.digest, self.split = bench.name, bench.digest, bench.split

@@ -31,7 +31,7 @@ from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.evaluation.answers import Answer
 from embomatrix.trainer.evaluation.intervals import mean_over_tasks, paired_difference
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict, executed_verdict, unparsable_verdict
-from embomatrix.trainer.learning.learner import Learner, SamplingRule
+from embomatrix.trainer.learning.learner import Learner, SamplingParams
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.serving.sampler import Draw, ServerSampler, begin_drawing
 
@@ -118,7 +118,7 @@ def evaluate_policy(
     A chunk of tasks has its own seed, so its plans are the same in whichever process they are sampled. Raises TrainerError if
     the cluster failed, or no worker took any plan.
     """
-    codec, rule = workers.local.policy.codec, SamplingRule(samples, settings.temperature, max_new)
+    codec, rule = workers.local.policy.codec, SamplingParams(samples, settings.temperature, max_new)
     chunks = [tasks[at : at + settings.chunk] for at in range(0, len(tasks), settings.chunk)]
     gateway.announce(dict(enumerate(chunks)), samples)
     # Without this report a display would show the phase before until the first plans are sampled and executed.

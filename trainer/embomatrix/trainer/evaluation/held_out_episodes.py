@@ -12,7 +12,7 @@ from embomatrix.trainer.episodes.client import ClusterEpisode, EpisodeClient, Pl
 from embomatrix.trainer.evaluation.episodes import episode_verdict
 from embomatrix.trainer.evaluation.held_out import HeldOutAnswer, HeldOutEvaluation, chunk_seed, task_score
 from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
-from embomatrix.trainer.learning.learner import SamplingRule
+from embomatrix.trainer.learning.learner import SamplingParams
 
 if TYPE_CHECKING:
     from embomatrix.trainer.data.tasks import TrainingTask
@@ -28,7 +28,7 @@ def evaluate_in_episodes(
     policy: Policy,
     planned: Sequence[PlannedEpisode],
     client: EpisodeClient,
-    rule: SamplingRule,
+    rule: SamplingParams,
     *,
     chunk: int,
     seed: int,

@@ -16,7 +16,7 @@ from embomatrix.skills.parse import DONE, PlanError, plan_to_lines
 from embomatrix.skills.prompt import limited, prompt_for
 from embomatrix.trainer.cluster.gateway import parse_policy_text
 from embomatrix.trainer.evaluation.answer_sources import OnProgress, seed_of
-from embomatrix.trainer.evaluation.episodes import EpisodeStage, Said, play_episodes
+from embomatrix.trainer.evaluation.episodes import AgentReply, EpisodeRunner, play_episodes
 
 if TYPE_CHECKING:
     from embomatrix.envs.player import EpisodePlayer
@@ -42,7 +42,7 @@ WritePlan = Callable[["Situation", int], WrittenPlan]
 """Writes a plan for a situation, as the n-th plan of an episode."""
 
 
-class ReplanningSubject:
+class ReplanningAgent:
     """Policy that plays one episode by whole plans. Says that it has done when a plan is carried out."""
 
     def __init__(self, write: WritePlan) -> None:
@@ -53,7 +53,7 @@ class ReplanningSubject:
 
     async def answer(
         self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
-    ) -> Said:
+    ) -> AgentReply:
         """Return the next call of the plan, or of a new one."""
         situation = player.observer.situation
         failed = bool(player.steps) and not player.steps[-1].ok
@@ -66,15 +66,15 @@ class ReplanningSubject:
             self._known = -1 if written.plan is None else len(situation.rows)
             self._calls = deque(written.plan or ())
             if written.plan is None:
-                return Said(NO_PLAN, completion_tokens=tokens)
+                return AgentReply(NO_PLAN, completion_tokens=tokens)
         text = plan_to_lines((self._calls.popleft(),)) if self._calls else DONE
-        return Said(text, completion_tokens=tokens)
+        return AgentReply(text, completion_tokens=tokens)
 
 
 def ask_policy_in_episodes(
     policy: Policy,
     rows: int,
-    stage: EpisodeStage,
+    stage: EpisodeRunner,
     questions: Sequence[Question],
     sheet: AnswerSheet,
     on_progress: OnProgress,
@@ -85,10 +85,10 @@ def ask_policy_in_episodes(
     """
     setup = sheet.setup
 
-    def subject_of(task_id: str, sample: int) -> ReplanningSubject:
-        return ReplanningSubject(functools.partial(_written, policy, rows, setup, f"{task_id}:{sample}"))
+    def agent_of(task_id: str, sample: int) -> ReplanningAgent:
+        return ReplanningAgent(functools.partial(_written, policy, rows, setup, f"{task_id}:{sample}"))
 
-    play_episodes(stage, subject_of, questions, sheet, on_progress)
+    play_episodes(stage, agent_of, questions, sheet, on_progress)
 
 
 def _written(

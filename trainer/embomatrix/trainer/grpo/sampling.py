@@ -19,7 +19,7 @@ from embomatrix.trainer.data.tasks import TrainingTask
 from embomatrix.trainer.episodes.batches import EpisodeBatch, PlayedBatch, play_batches
 from embomatrix.trainer.episodes.client import EpisodeClient, PlannedEpisode
 from embomatrix.trainer.grpo.step_advantages import AnswerStates, StepRule
-from embomatrix.trainer.learning.learner import SamplingRule
+from embomatrix.trainer.learning.learner import SamplingParams
 from embomatrix.trainer.policy.prompts import PromptBuilder, TaskPrompt
 from embomatrix.trainer.policy.protocol import Samples
 from embomatrix.trainer.serving.sampler import Draw, ServerSampler, begin_drawing
@@ -140,7 +140,7 @@ class Sampler:
         self, step: int, parts: Sequence[_Part], rng: np.random.Generator, seed_of: Callable[[str], int]
     ) -> list[SampledChunk]:
         """Sample the parts of a step and submit their plans. ``seed_of`` returns the seed of a task's rollouts."""
-        rule = SamplingRule.of(self._settings)
+        rule = SamplingParams.of(self._settings)
         jobs = []
         for part in parts:
             prompts = [(task, self._prompt_builder.varied(task, rng)) for task in part.tasks]
@@ -211,7 +211,7 @@ class EpisodeSampler(Sampler):
             )
             for part in parts
         ]
-        rule = replace(SamplingRule.of(self._settings), max_new=self._terms.answer_tokens)
+        rule = replace(SamplingParams.of(self._settings), max_new=self._terms.answer_tokens)
         played = play_batches(batches, self._workers, self._client, self._policy, rule)
         here = [self._workers.remote(each.batch.index) is None for each in played]
         return [self._chunk_of(each, here=is_here) for each, is_here in zip(played, here, strict=True)]

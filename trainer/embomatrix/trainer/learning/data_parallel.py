@@ -27,7 +27,7 @@ from torch import Tensor
 from embomatrix.host.anonymous_memory import nameless_file
 from embomatrix.trainer.config.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.config.settings import TrainSettings
-from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingRule
+from embomatrix.trainer.learning.learner import Learner, Microbatch, SamplingParams
 from embomatrix.trainer.learning.objective import LossMetrics
 from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
 from embomatrix.trainer.policy.loading import saved_policy
@@ -91,11 +91,11 @@ class RemoteLearner:
         """Load the reference policy, which GRPO needs."""
         self._request("use_reference", folder)
 
-    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingParams) -> Samples:
         samples: Samples = self._request("sample", tuple(prompts), seed, rule)
         return samples
 
-    def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
+    def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingParams) -> None:
         self._request("begin_episodes", number, tuple(prompts), seed, rule)
 
     def answer_episodes(

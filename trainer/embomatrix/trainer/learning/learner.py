@@ -36,7 +36,7 @@ class Microbatch:
 
 
 @dataclass(frozen=True, slots=True)
-class SamplingRule:
+class SamplingParams:
     """Rule of sampling: ``group`` plans or episodes per prompt. A plan, or an answer in an episode, has at most ``max_new``
     tokens.
     """
@@ -46,9 +46,9 @@ class SamplingRule:
     max_new: int
 
     @staticmethod
-    def of(settings: GrpoSettings) -> SamplingRule:
+    def of(settings: GrpoSettings) -> SamplingParams:
         """Return the rule by which GRPO samples."""
-        return SamplingRule(settings.group, settings.temperature, settings.max_new)
+        return SamplingParams(settings.group, settings.temperature, settings.max_new)
 
 
 class Learner:
@@ -60,13 +60,13 @@ class Learner:
         self._settings = settings
         self._episodes: dict[int, EpisodeRows | ChatRows] = {}
 
-    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Samples:
+    def sample(self, prompts: Sequence[Tokens], seed: int, rule: SamplingParams) -> Samples:
         """Draw plans for each prompt with a generator of this seed."""
         device = next(iter(self.policy.parameters())).device
         generator = torch.Generator(device).manual_seed(seed)
         return self.policy.sample(prompts, rule.group, rule.temperature, rule.max_new, generator)
 
-    def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> None:
+    def begin_episodes(self, number: int, prompts: Sequence[Tokens], seed: int, rule: SamplingParams) -> None:
         """Begin the batch of episodes of this number, with ``rule.group`` for each prompt."""
         self._episodes[number] = rows_of_episodes(
             self.policy, prompts, rule.group, rule.temperature, seed, rule.max_new

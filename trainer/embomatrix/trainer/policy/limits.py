@@ -64,7 +64,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Ruler:
+class TokenCounter:
     """Measures of texts for one model: tokens of prompts and of plans with their end token, and words that it can't write.
 
     ``context`` is the maximum number of tokens of a prompt and a plan together, None if there is no limit or none is known.
@@ -77,9 +77,9 @@ class Ruler:
     unknown_words: Callable[[str], frozenset[str]]
 
     @staticmethod
-    def of_policy(policy: Policy) -> Ruler:
+    def of_policy(policy: Policy) -> TokenCounter:
         """Measure with the tokenizer of a policy in this process."""
-        return Ruler(
+        return TokenCounter(
             policy.codec,
             policy.context,
             lambda prompt: len(policy.encode(prompt)),
@@ -88,9 +88,9 @@ class Ruler:
         )
 
     @staticmethod
-    def of_vocabulary(vocabulary: Vocabulary, shape: DecoderShape) -> Ruler:
+    def of_vocabulary(vocabulary: Vocabulary, shape: DecoderShape) -> TokenCounter:
         """Measure with the vocabulary of a word-level policy, without the policy."""
-        return Ruler(
+        return TokenCounter(
             Codec.NAMES,
             shape.longest,
             lambda prompt: min(len(vocabulary.encode(prompt.user)), longest_prompt(shape)) + 1,
@@ -99,9 +99,9 @@ class Ruler:
         )
 
     @staticmethod
-    def of_unread_tokenizer(codec: Codec) -> Ruler:
+    def of_unread_tokenizer(codec: Codec) -> TokenCounter:
         """Estimate the tokens of a language model from the characters: rather too many than too few."""
-        return Ruler(
+        return TokenCounter(
             codec,
             None,
             lambda prompt: math.ceil(len(prompt.system + prompt.user) / CHARACTERS_PER_PROMPT_TOKEN),
@@ -110,13 +110,13 @@ class Ruler:
         )
 
     @staticmethod
-    def of_endpoint(codec: Codec) -> Ruler:
+    def of_endpoint(codec: Codec) -> TokenCounter:
         """Estimate the tokens from the characters, because an endpoint's tokenizer and context are unknown."""
 
         def estimate(text: str) -> int:
             return math.ceil(len(text) / CHARACTERS_PER_TOKEN)
 
-        return Ruler(
+        return TokenCounter(
             codec, None, lambda prompt: estimate(prompt.system + prompt.user), estimate, lambda _: frozenset()
         )
 
@@ -165,40 +165,40 @@ def with_limits(settings: TrainSettings, policy: Policy, tasks: TaskSet) -> Trai
     defaults. In episodes nothing follows from them. Raises TrainerError if a prompt leaves no room for a plan or an answer.
     """
     if settings.episodes.visibility is not None:
-        check_openings(settings.episodes.answer_tokens, Ruler.of_policy(policy), tasks)
+        check_openings(settings.episodes.answer_tokens, TokenCounter.of_policy(policy), tasks)
         return settings
-    return with_measured_limits(settings, Ruler.of_policy(policy), tasks)
+    return with_measured_limits(settings, TokenCounter.of_policy(policy), tasks)
 
 
-def with_measured_limits(settings: TrainSettings, ruler: Ruler, tasks: TaskSet) -> TrainSettings:
+def with_measured_limits(settings: TrainSettings, counter: TokenCounter, tasks: TaskSet) -> TrainSettings:
     """Return the settings of ``with_limits`` for a model that is known by its ruler alone."""
     taught = [task for task in tasks.train if task.oracle]
     if taught and "rows" not in settings.prompt.model_fields_set:
         rows = max(map(rows_needed, taught))
         settings = settings.model_copy(update={"prompt": settings.prompt.model_copy(update={"rows": rows})})
     rows = settings.prompt.rows
-    prompts = prompts_of((*tasks.train, *tasks.heldout), rows, ruler.codec)
+    prompts = prompts_of((*tasks.train, *tasks.heldout), rows, counter.codec)
     if taught and "max_new" not in settings.grpo.model_fields_set:
-        longest = max(ruler.plan_tokens(plan_of(task, rows, ruler.codec)) for task in taught)
-        max_new = room_for(math.ceil(MARGIN * longest), prompts, ruler)
+        longest = max(counter.plan_tokens(plan_of(task, rows, counter.codec)) for task in taught)
+        max_new = room_for(math.ceil(MARGIN * longest), prompts, counter)
         settings = settings.model_copy(update={"grpo": settings.grpo.model_copy(update={"max_new": max_new})})
-    check_context(prompts, settings.grpo.max_new, ruler, "grpo.max_new")
+    check_context(prompts, settings.grpo.max_new, counter, "grpo.max_new")
     return settings
 
 
-def check_openings(answer_tokens: int, ruler: Ruler, tasks: TaskSet) -> None:
+def check_openings(answer_tokens: int, counter: TokenCounter, tasks: TaskSet) -> None:
     """Raise TrainerError if an episode's opening that tells of all objects leaves no room for an answer."""
-    if ruler.context is None:
+    if counter.context is None:
         return
     openings = {
-        task.task.task_id: opening(task.situation, ruler.codec, seen=False, at_once=1)
+        task.task.task_id: opening(task.situation, counter.codec, seen=False, at_once=1)
         for task in (*tasks.train, *tasks.heldout)
     }
-    task_id, tokens = _longest(openings, ruler)
-    if tokens + answer_tokens >= ruler.context:
+    task_id, tokens = _longest(openings, counter)
+    if tokens + answer_tokens >= counter.context:
         raise TrainerError(
             f"the opening of an episode of the task {task_id!r} has {tokens} tokens, and episodes.answer_tokens is "
-            f"{answer_tokens}: both must fit into the model's context of {ruler.context}; lower episodes.answer_tokens, or "
+            f"{answer_tokens}: both must fit into the model's context of {counter.context}; lower episodes.answer_tokens, or "
             "pass a model with a longer context"
         )
 
@@ -208,43 +208,43 @@ def prompts_of(tasks: Iterable[TrainingTask], rows: int, codec: Codec) -> dict[s
     return {task.task.task_id: prompt_for(limited(task.situation, rows), codec) for task in tasks}
 
 
-def room_for(wanted: int, prompts: Mapping[str, Prompt], ruler: Ruler) -> int:
+def room_for(wanted: int, prompts: Mapping[str, Prompt], counter: TokenCounter) -> int:
     """Return the tokens that are left of the context beside the longest prompt, at most ``wanted``.
 
     Raises TrainerError if there are none.
     """
-    if ruler.context is None or not prompts:
+    if counter.context is None or not prompts:
         return wanted
-    task_id, tokens = _longest(prompts, ruler)
-    if tokens >= ruler.context:
+    task_id, tokens = _longest(prompts, counter)
+    if tokens >= counter.context:
         raise TrainerError(
-            f"the prompt of the task {task_id!r} has {tokens} tokens, but the model's context has {ruler.context}: lower "
+            f"the prompt of the task {task_id!r} has {tokens} tokens, but the model's context has {counter.context}: lower "
             "prompt.rows, or pass a model with a longer context"
         )
-    return min(wanted, ruler.context - tokens)
+    return min(wanted, counter.context - tokens)
 
 
-def check_context(prompts: Mapping[str, Prompt], max_new: int, ruler: Ruler, setting: str) -> None:
+def check_context(prompts: Mapping[str, Prompt], max_new: int, counter: TokenCounter, setting: str) -> None:
     """Raise TrainerError if a prompt and the longest plan allowed exceed the model's context. ``setting`` names ``max_new``."""
-    room = room_for(max_new, prompts, ruler)
+    room = room_for(max_new, prompts, counter)
     if room < max_new:
-        task_id, tokens = _longest(prompts, ruler)
+        task_id, tokens = _longest(prompts, counter)
         raise TrainerError(
             f"the prompt of the task {task_id!r} has {tokens} tokens, which leaves {room} of the model's context of "
-            f"{ruler.context}, and {setting} is {max_new}: lower one of {setting} and prompt.rows, or pass a model with "
+            f"{counter.context}, and {setting} is {max_new}: lower one of {setting} and prompt.rows, or pass a model with "
             "a longer context"
         )
 
 
-def _longest(prompts: Mapping[str, Prompt], ruler: Ruler) -> tuple[str, int]:
+def _longest(prompts: Mapping[str, Prompt], counter: TokenCounter) -> tuple[str, int]:
     """Return the task with the longest prompt, and its tokens."""
-    lengths = {task_id: ruler.prompt_tokens(prompt) for task_id, prompt in prompts.items()}
+    lengths = {task_id: counter.prompt_tokens(prompt) for task_id, prompt in prompts.items()}
     task_id = max(lengths, key=lengths.__getitem__)
     return task_id, lengths[task_id]
 
 
 def expressibility(
-    tasks: Sequence[TrainingTask], limits: Limits, ruler: Ruler, *, refused: int = 0
+    tasks: Sequence[TrainingTask], limits: Limits, counter: TokenCounter, *, refused: int = 0
 ) -> Expressibility:
     """Examine tasks. Those without an oracle plan are left out. ``refused`` further tasks need skills that are not offered."""
     known = [task for task in tasks if task.oracle]
@@ -253,11 +253,11 @@ def expressibility(
     most_rows = max(map(rows_needed, known), default=1)
     most_tokens = 1
     for task in known:
-        text = plan_of(task, limits.rows, ruler.codec)
-        unknown, rows, tokens = ruler.unknown_words(text), rows_needed(task), ruler.plan_tokens(text)
+        text = plan_of(task, limits.rows, counter.codec)
+        unknown, rows, tokens = counter.unknown_words(text), rows_needed(task), counter.plan_tokens(text)
         words |= unknown
         # Names get numbers when more rows of their category are listed, so plans grow with the rows.
-        with_all = ruler.plan_tokens(plan_of(task, most_rows, ruler.codec))
+        with_all = counter.plan_tokens(plan_of(task, most_rows, counter.codec))
         most_tokens = max(most_tokens, tokens, with_all)
         if unknown & set(Skill):
             obstacles[Obstacle.SKILLS] += 1

@@ -28,7 +28,7 @@ from embomatrix.trainer.grpo.records import GroupLog, StepRecord
 from embomatrix.trainer.grpo.sampling import EpisodeSampler, Sampler
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.learning.data_parallel import DataParallelWorkers
-from embomatrix.trainer.learning.learner import SamplingRule
+from embomatrix.trainer.learning.learner import SamplingParams
 from embomatrix.trainer.lifecycle.checkpoint import CHECKPOINTS, CheckpointStore, atomic_folder, restore
 from embomatrix.trainer.lifecycle.interrupts import DeferredInterrupts
 from embomatrix.trainer.lifecycle.stopwatch import Activity, Stopwatch
@@ -217,7 +217,7 @@ class TrainingRun:
             start.policy,
             planned,
             EpisodeClient(self._gateway, terms, start.policy.codec),
-            SamplingRule(samples, settings.temperature, terms.answer_tokens),
+            SamplingParams(samples, settings.temperature, terms.answer_tokens),
             chunk=settings.chunk,
             seed=seed,
             report=report,

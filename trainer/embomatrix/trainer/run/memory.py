@@ -19,7 +19,7 @@ from embomatrix.trainer.policy.footprint import (
     WordLevelFootprint,
     precision_of,
 )
-from embomatrix.trainer.policy.limits import Ruler, plan_of, prompts_of, with_measured_limits
+from embomatrix.trainer.policy.limits import TokenCounter, plan_of, prompts_of, with_measured_limits
 from embomatrix.trainer.policy.loading import is_word_level, word_level_shape
 from embomatrix.trainer.policy.memory_plan import (
     GB,
@@ -66,9 +66,9 @@ def forecast(dataset: Path, model: str, settings_file: Path | None, changes: Map
         settings = settings.model_copy(update={"device": GPU})
     word_level = is_word_level(model)
     tasks = load_tasks(dataset)
-    footprint, ruler = (_word_level if word_level else _language_model)(settings, tasks)
-    settings = with_measured_limits(settings, ruler, tasks)
-    lengths = lengths_of(tasks, settings, ruler)
+    footprint, counter = (_word_level if word_level else _language_model)(settings, tasks)
+    settings = with_measured_limits(settings, counter, tasks)
+    lengths = lengths_of(tasks, settings, counter)
 
     def plan(changed: TrainSettings) -> MemoryPlan:
         return plan_memory(changed, footprint(changed), lengths)
@@ -77,25 +77,25 @@ def forecast(dataset: Path, model: str, settings_file: Path | None, changes: Map
     return Forecast(settings, lengths, plan(settings), best, word_level)
 
 
-def lengths_of(tasks: TaskSet, settings: TrainSettings, ruler: Ruler) -> Lengths:
+def lengths_of(tasks: TaskSet, settings: TrainSettings, counter: TokenCounter) -> Lengths:
     """Return the longest prompt of all tasks, and the longest oracle plan for training, in tokens."""
     rows = settings.prompt.rows
-    prompts = prompts_of((*tasks.train, *tasks.heldout), rows, ruler.codec).values()
-    plans = [ruler.plan_tokens(plan_of(task, rows, ruler.codec)) for task in tasks.train if task.oracle]
-    return Lengths(max(map(ruler.prompt_tokens, prompts)), max(plans, default=1))
+    prompts = prompts_of((*tasks.train, *tasks.heldout), rows, counter.codec).values()
+    plans = [counter.plan_tokens(plan_of(task, rows, counter.codec)) for task in tasks.train if task.oracle]
+    return Lengths(max(map(counter.prompt_tokens, prompts)), max(plans, default=1))
 
 
 def _word_level(
     settings: TrainSettings, tasks: TaskSet
-) -> tuple[Callable[[TrainSettings], Footprint], Ruler]:
+) -> tuple[Callable[[TrainSettings], Footprint], TokenCounter]:
     vocabulary, shape = word_level_shape(settings, tasks)
     casts = torch_dtype(settings.compute_dtype, settings.device) is torch.bfloat16
-    return lambda _: WordLevelFootprint(shape, casts), Ruler.of_vocabulary(vocabulary, shape)
+    return lambda _: WordLevelFootprint(shape, casts), TokenCounter.of_vocabulary(vocabulary, shape)
 
 
 def _language_model(
     settings: TrainSettings, _: TaskSet
-) -> tuple[Callable[[TrainSettings], Footprint], Ruler]:
+) -> tuple[Callable[[TrainSettings], Footprint], TokenCounter]:
     shape = language_model_shape(settings.model)
     casts = torch_dtype(settings.compute_dtype, settings.device) is torch.bfloat16
 
@@ -103,7 +103,7 @@ def _language_model(
         precision = precision_of(changed, casts=casts)
         return LanguageModelFootprint(shape, precision, changed.lora, changed.gradient_checkpointing)
 
-    return footprint, Ruler.of_unread_tokenizer(settings.codec)
+    return footprint, TokenCounter.of_unread_tokenizer(settings.codec)
 
 
 def memory_text(found: Forecast, gpu_gb: float) -> str:

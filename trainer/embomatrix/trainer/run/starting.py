@@ -34,7 +34,7 @@ from embomatrix.trainer.logging.report import REPORT
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.limits import (
     Limits,
-    Ruler,
+    TokenCounter,
     expressibility,
     prompts_of,
     sentence_about,
@@ -125,12 +125,12 @@ class RunStart:
         if (terms := EpisodeTerms.of(self.settings.episodes)) is not None:
             return (terms.sentence,)
         limits = Limits(self.settings.prompt.rows, self.settings.grpo.max_new)
-        ruler = Ruler.of_policy(self.policy)
+        counter = TokenCounter.of_policy(self.policy)
         splits = {"training tasks": self.tasks.train, "held-out tasks": self.tasks.heldout}
         return (
             f"limits: {limits.rows} object rows in a prompt (prompt.rows), {limits.max_new} tokens in a plan (grpo.max_new)",
             *(
-                sentence_about(expressibility(tasks, limits, ruler), named, limits, "grpo.max_new")
+                sentence_about(expressibility(tasks, limits, counter), named, limits, "grpo.max_new")
                 for named, tasks in splits.items()
                 if tasks
             ),

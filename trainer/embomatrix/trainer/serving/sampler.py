@@ -19,7 +19,7 @@ import torch
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import ServerKind, TrainSettings
 from embomatrix.trainer.learning.data_parallel import RemoteLearner
-from embomatrix.trainer.learning.learner import Learner, SamplingRule
+from embomatrix.trainer.learning.learner import Learner, SamplingParams
 from embomatrix.trainer.lifecycle.checkpoint import atomic_folder
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.protocol import Samples, Tokens
@@ -50,7 +50,7 @@ class ServerSampler:
         self._names = (f"embomatrix-{run}-{number}" for number in itertools.count())
         self._kept: Path | None = None
 
-    def begin(self, prompts: Sequence[Tokens], seed: int, rule: SamplingRule) -> Callable[[], Samples]:
+    def begin(self, prompts: Sequence[Tokens], seed: int, rule: SamplingParams) -> Callable[[], Samples]:
         """Begin to draw plans. Return a function that waits for them and raises TrainerError."""
         ends = self._policy.end_tokens
         future = self._server.plans(
@@ -112,7 +112,7 @@ class ServerSampler:
                 f"{error}; it must be able to read the weights in {self._folder} (sampler.folder){adapters}"
             ) from error
         temperature = settings.grpo.temperature
-        rule = SamplingRule(PROBE_PLANS, temperature, min(PROBE_TOKENS, settings.grpo.max_new))
+        rule = SamplingParams(PROBE_PLANS, temperature, min(PROBE_TOKENS, settings.grpo.max_new))
         samples = self.begin((longest,), settings.seed, rule)()
         gap = self._gap(longest, samples, temperature)
         if gap > ROUNDING_NATS and self._gap(longest, samples, 1.0) < gap / 2:
@@ -150,7 +150,7 @@ class ServerSampler:
 
 
 def begin_drawing(
-    server: ServerSampler | None, prompts: Sequence[Tokens], seed: int, rule: SamplingRule
+    server: ServerSampler | None, prompts: Sequence[Tokens], seed: int, rule: SamplingParams
 ) -> Draw:
     """Return the function that draws plans of the prompts. A model server begins at once, a learner when it is called."""
     if server is None:

@@ -1,4 +1,4 @@
-"""Subjects of `embomatrix eval`: a model in this process, an endpoint or a baseline, ready to answer.
+"""Models that `embomatrix eval` asks: one in this process, an endpoint or a baseline, ready to answer.
 
 torch is imported only for a model in this process.
 """
@@ -31,15 +31,15 @@ from embomatrix.trainer.evaluation.answer_sources import (
 from embomatrix.trainer.evaluation.answers import AnswerSheet
 from embomatrix.trainer.evaluation.baselines import PLANNERS, SCRIPTS, BaselineName, fitted_scripts
 from embomatrix.trainer.evaluation.episodes import (
+    EpisodeAgent,
     EpisodeExam,
-    EpisodeSubject,
-    PlanSubject,
-    SearchingSubject,
+    PlanAgent,
+    SearchingAgent,
     ask_endpoint_in_episodes,
     play_episodes,
 )
 from embomatrix.trainer.evaluation.exam import Question, WorldExam
-from embomatrix.trainer.policy.limits import ANSWER_TOKENS, Ruler, check_context, room_for
+from embomatrix.trainer.policy.limits import ANSWER_TOKENS, TokenCounter, check_context, room_for
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.task import MAX_TABLE
 
@@ -51,20 +51,20 @@ MAX_TOKENS: Final = "max_tokens"
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class EvaluatedModel:
     """Model, endpoint or baseline that is ready to answer, with its codec, maximum table rows and maximum tokens.
 
-    ``ruler`` measures prompts and plans for it, None for a baseline.
+    ``counter`` measures prompts and plans for it, None for a baseline.
     """
 
     ask: Callable[[Sequence[Question], AnswerSheet, OnProgress], None]
     codec: Codec = Codec.JSON
     rows: int = MAX_TABLE
     max_tokens: int = 1
-    ruler: Ruler | None = None
+    counter: TokenCounter | None = None
 
 
-def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
+def evaluated_policy(exam: Exam, model: str, settings: EvalSettings) -> EvaluatedModel:
     """Load the model. Raises TrainerError."""
     from embomatrix.trainer.evaluation.models import load_model
     from embomatrix.trainer.policy.playing import plays_episodes
@@ -74,33 +74,37 @@ def policy_subject(exam: Exam, model: str, settings: EvalSettings) -> Subject:
         raise TrainerError(
             f"{model} is a word-level policy, which can't read {NATIVE}'s prompts: pass another model"
         )
-    ruler = Ruler.of_policy(policy)
+    counter = TokenCounter.of_policy(policy)
     prompts = {each.task_id: each.prompt for each in exam.questions(policy.codec, trained.prompt.rows)}
     in_episodes = plays_episodes(policy)
-    room = trained.episodes.answer_tokens if in_episodes else room_for(trained.grpo.max_new, prompts, ruler)
+    room = trained.episodes.answer_tokens if in_episodes else room_for(trained.grpo.max_new, prompts, counter)
     max_tokens = settings.max_tokens or room
     if not in_episodes:
-        check_context(prompts, max_tokens, ruler, MAX_TOKENS)
+        check_context(prompts, max_tokens, counter, MAX_TOKENS)
     rows = trained.prompt.rows
     if in_episodes:
         if not isinstance(exam, EpisodeExam):
             raise TrainerError(f"{model} was trained in episodes and writes no plans: pass --interactive")
-        from embomatrix.trainer.evaluation.conversing import converse_in_episodes
+        from embomatrix.trainer.evaluation.policy_agent import converse_in_episodes
 
-        return Subject(
-            functools.partial(converse_in_episodes, policy, exam.stage), policy.codec, rows, max_tokens, ruler
+        return EvaluatedModel(
+            functools.partial(converse_in_episodes, policy, exam.stage),
+            policy.codec,
+            rows,
+            max_tokens,
+            counter,
         )
     if isinstance(exam, EpisodeExam):
         from embomatrix.trainer.evaluation.replanning import ask_policy_in_episodes
 
         playing = functools.partial(ask_policy_in_episodes, policy, rows, exam.stage)
-        return Subject(playing, Codec.LINES, rows, max_tokens, ruler)
-    return Subject(functools.partial(ask_policy, policy), policy.codec, rows, max_tokens, ruler)
+        return EvaluatedModel(playing, Codec.LINES, rows, max_tokens, counter)
+    return EvaluatedModel(functools.partial(ask_policy, policy), policy.codec, rows, max_tokens, counter)
 
 
-def endpoint_subject(
+def evaluated_endpoint(
     exam: Exam, url: str, model_name: str, key: str, settings: EvalSettings, folder: Path
-) -> Subject:
+) -> EvaluatedModel:
     if not model_name:
         raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
     if settings.codec is Codec.NAMES:
@@ -114,10 +118,10 @@ def endpoint_subject(
     else:
         ask = functools.partial(ask_endpoint, connect, folder / "ledger.jsonl")
     codec, max_tokens = settings.codec or Codec.JSON, settings.max_tokens or ANSWER_TOKENS
-    return Subject(ask, codec, max_tokens=max_tokens, ruler=Ruler.of_endpoint(codec))
+    return EvaluatedModel(ask, codec, max_tokens=max_tokens, counter=TokenCounter.of_endpoint(codec))
 
 
-def playing_baseline(exam: EpisodeExam, baseline: BaselineName, seed: int) -> Subject:
+def playing_baseline(exam: EpisodeExam, baseline: BaselineName, seed: int) -> EvaluatedModel:
     """Baseline that plays episodes. Raises TrainerError for one that doesn't."""
     if baseline in SCRIPTS:
         raise TrainerError(
@@ -130,16 +134,16 @@ def playing_baseline(exam: EpisodeExam, baseline: BaselineName, seed: int) -> Su
         training = read_tasks(Dataset(exam.bench.training.folder, exam.bench.training.train))
         priors = PlacePriors(task.situation for task in training.values())
 
-        def subject_of(task_id: str, sample: int) -> EpisodeSubject:
-            return SearchingSubject(tasks[task_id], priors)
+        def agent_of(task_id: str, sample: int) -> EpisodeAgent:
+            return SearchingAgent(tasks[task_id], priors)
     else:
         plan = PLANNERS[baseline]
 
-        def subject_of(task_id: str, sample: int) -> EpisodeSubject:
+        def agent_of(task_id: str, sample: int) -> EpisodeAgent:
             rng = np.random.default_rng(seed_of(seed, task_id, sample))
-            return PlanSubject(plan(tasks[task_id], rng))
+            return PlanAgent(plan(tasks[task_id], rng))
 
-    return Subject(functools.partial(play_episodes, exam.stage, subject_of), Codec.LINES)
+    return EvaluatedModel(functools.partial(play_episodes, exam.stage, agent_of), Codec.LINES)
 
 
 def written_baseline(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from embomatrix.skills.prompt import Prompt
 from embomatrix.trainer.evaluation.answer_sources import OnProgress, seed_of
-from embomatrix.trainer.evaluation.episodes import EpisodeStage, Said, play_episodes
+from embomatrix.trainer.evaluation.episodes import AgentReply, EpisodeRunner, play_episodes
 
 if TYPE_CHECKING:
     from embomatrix.envs.player import EpisodePlayer
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy
 
 
-class ConversingSubject:
+class PolicyAgent:
     """Policy that plays one episode. It keeps its key-value cache between two answers."""
 
     def __init__(self, policy: Policy, setup: EvaluationSetup, task_id: str, sample: int) -> None:
@@ -30,7 +30,7 @@ class ConversingSubject:
 
     async def answer(
         self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
-    ) -> Said:
+    ) -> AgentReply:
         """Return the next call, or that the task is done."""
         if self._episode is None:
             self._episode = self._begun(Prompt(system, observations[-1]))
@@ -39,8 +39,8 @@ class ConversingSubject:
         answer = self._episode.answer([0])[0]
         if answer is None:
             player.stop()
-            return Said("")
-        return Said(answer, completion_tokens=len(self._policy.encode_answer(answer)))
+            return AgentReply("")
+        return AgentReply(answer, completion_tokens=len(self._policy.encode_answer(answer)))
 
     def _begun(self, opening: Prompt) -> EpisodeRows | ChatRows:
         from embomatrix.trainer.policy.playing import rows_of_episodes
@@ -51,7 +51,7 @@ class ConversingSubject:
 
 def converse_in_episodes(
     policy: Policy,
-    stage: EpisodeStage,
+    stage: EpisodeRunner,
     questions: Sequence[Question],
     sheet: AnswerSheet,
     on_progress: OnProgress,
@@ -61,7 +61,7 @@ def converse_in_episodes(
     Each episode has a seed of its own, so a resumed evaluation draws the same answers.
     """
 
-    def subject_of(task_id: str, sample: int) -> ConversingSubject:
-        return ConversingSubject(policy, sheet.setup, task_id, sample)
+    def agent_of(task_id: str, sample: int) -> PolicyAgent:
+        return PolicyAgent(policy, sheet.setup, task_id, sample)
 
-    play_episodes(stage, subject_of, questions, sheet, on_progress)
+    play_episodes(stage, agent_of, questions, sheet, on_progress)
