@@ -253,14 +253,17 @@ class Updater:
             take(chunks, state)
 
     def _scale_to_signal(self, state: _StepState) -> None:
-        """Rescale the gradient from all groups of the step to those with a signal, if there is a reserve."""
-        learning = sum(group.learns for group in state.groups)
+        """Rescale the gradient from all groups of the step to those with a signal, if there is a reserve.
+
+        Tokens of lost plans count, as they do without a reserve. BNPO's microbatches keep their own denominators.
+        """
+        learning = [group for group in state.groups if group.learns]
         if not state.plan.reserve or not learning:
             return
         kind = self._settings.loss
         final = LossTotals(
-            plans=learning * self._settings.group,
-            tokens=sum(metrics.weight for metrics in state.metrics),
+            plans=len(learning) * self._settings.group,
+            tokens=sum(group.counted for group in learning),
             longest=self._settings.max_new,
             microbatches=len(state.metrics),
         )
