@@ -12,7 +12,8 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, manager, open_run
 from tests.integration.test_rest import http_at
 
-from embomatrix.manager.web.rewards import REWARDS, RUN_ID
+from embomatrix.manager.web.rewards import REWARDS, RUN_ID, run_of
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.reward_label import RewardLabel
 from embomatrix.rpc.wire.tokens import AccessRole
 from embomatrix.trainer.adapters.openrlhf import rows
@@ -52,6 +53,31 @@ async def test_plans_are_scored_in_order_and_unparsable_texts_are_not_executed(t
     }
     assert len(worker.executed) == 2
     assert RUN_ID in {run["run_id"] for run in runs}
+
+
+async def test_address_names_coefficients_and_requests_with_equal_ones_share_a_run(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address),
+        FakeWorker(at.address, slots=2),
+        http_at(at) as http,
+    ):
+        answers = [
+            await http.post(f"{REWARDS}{query}", json=asked("move 3", "I can't."))
+            for query in ("?goal=10&unparsable=-2", "?unparsable=-2.0&goal=10.0", "?unparsable=-3", "?goal=30")
+        ]
+        runs = {run["run_id"] for run in (await http.get("/api/v1/runs")).json()["items"]}
+        refused = [
+            await http.post(f"{REWARDS}?{query}", json=asked("move 3"))
+            for query in ("goal=-1", "goal=much", "gaol=1")
+        ]
+    assert [answer.json()["rewards"][1] for answer in answers] == [-2.0, -2.0, -3.0, -1.0]
+    assert answers[0].json()["extra_logs"]["goal"] == answers[1].json()["extra_logs"]["goal"]
+    settings = (RewardSettings(goal=10.0, unparsable=-2.0), RewardSettings(unparsable=-3.0), PAPER)
+    assert {run_of(each) for each in settings} == {run for run in runs if run.startswith(RUN_ID)}
+    assert [answer.status_code for answer in refused] == [422, 422, 422]
+    for answer, words in zip(refused, ("found -1: expected 0 or more", "goal", "gaol"), strict=True):
+        assert words in answer.text
 
 
 async def test_concurrent_requests_share_a_run(tmp_path):

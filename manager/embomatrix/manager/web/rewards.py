@@ -6,11 +6,12 @@ Each request is one batch of a run that all such requests share, and waits until
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import secrets
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Annotated, Final
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
 
 from embomatrix.manager.runtime.results import BatchLog
@@ -21,16 +22,17 @@ from embomatrix.manager.web.rest import PREFIX
 from embomatrix.manager.web.reward_request import RewardAnswer, RewardRequest
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.reward.hierarchy import unparsable
-from embomatrix.rpc.status import UnavailableError
+from embomatrix.reward.hierarchy import unparsable as score_of_no_plan
+from embomatrix.reward.settings import PAPER, RewardSettings, RewardSettingsError
+from embomatrix.rpc.status import InvalidRequestError, UnavailableError
 from embomatrix.rpc.wire.outcome import rollout_result_from_proto
 from embomatrix.rpc.wire.values import Batch, Completed, GroupPolicy, Outcome, Rollout, RunTerms
 
 REWARDS: Final = f"{PREFIX}/rewards"
 RUN_ID: Final = "http-rewards"
-TERMS: Final = RunTerms(GroupPolicy.PARTIAL)
 LONGEST_S: Final = 170.0
 """OpenRLHF's client repeats a request after 180 s."""
+_Coefficient = Annotated[float, Query(description="Coefficient of the reward; by default the paper's.")]
 
 
 def reward_routes(runs: Runs) -> APIRouter:
@@ -44,14 +46,25 @@ def reward_routes(runs: Runs) -> APIRouter:
         response_model=RewardAnswer,
         openapi_extra={"requestBody": _BODY},
     )
-    async def rewards(request: Request) -> JSONResponse:
+    async def rewards(
+        request: Request,
+        unparsable: _Coefficient = PAPER.unparsable,
+        format: _Coefficient = PAPER.format,  # the coefficient's name
+        relevance_per_object: _Coefficient = PAPER.relevance_per_object,
+        relevance_limit: _Coefficient = PAPER.relevance_limit,
+        goal: _Coefficient = PAPER.goal,
+    ) -> JSONResponse:
         """Reward, success (as score) and tiers of each answer; 503 after an infrastructure failure."""
+        try:
+            settings = RewardSettings(unparsable, format, relevance_per_object, relevance_limit, goal)
+        except RewardSettingsError as error:
+            raise InvalidRequestError(str(error)) from error
         body = await bodies.receive(request)
         try:
             answers = await parser.parse(body)
         finally:
             bodies.release(request, len(body))
-        return JSONResponse(_response(await _rewards(runs, answers)))
+        return JSONResponse(_response(await _rewards(runs, answers, settings)))
 
     return router
 
@@ -59,30 +72,37 @@ def reward_routes(runs: Runs) -> APIRouter:
 _BODY: Final = {"content": {"application/json": {"schema": RewardRequest.model_json_schema()}}}
 
 
-async def _rewards(runs: Runs, answers: Sequence[Answer]) -> list[RewardBreakdown]:
+async def _rewards(runs: Runs, answers: Sequence[Answer], settings: RewardSettings) -> list[RewardBreakdown]:
     """Return the rewards in the order of the answers. Unparsable answers are scored here and never executed."""
-    batch_id = secrets.token_hex(8)
+    run_id, batch_id = run_of(settings), secrets.token_hex(8)
     found: dict[int, RewardBreakdown] = {}
     rollouts: dict[int, Rollout] = {}
     for index, (label, plan) in enumerate(answers):
         if plan is None:
-            found[index] = unparsable()
+            found[index] = score_of_no_plan(settings)
             continue
-        group = f"{RUN_ID}/{batch_id}/{label.task_id}"
+        group = f"{run_id}/{batch_id}/{label.task_id}"
         rollouts[index] = Rollout(
-            f"{RUN_ID}/{batch_id}/{index}", group, label.bundle_digest, label.task_id, plan, label.seed
+            f"{run_id}/{batch_id}/{index}", group, label.bundle_digest, label.task_id, plan, label.seed
         )
     if rollouts:
-        batch = Batch(RUN_ID, batch_id, 0, tuple(rollouts.values()))
-        outcomes = await _executed(runs, batch)
+        batch = Batch(run_id, batch_id, 0, tuple(rollouts.values()))
+        outcomes = await _executed(runs, batch, settings)
         for index, rollout in rollouts.items():
             found[index] = _reward(outcomes.get(rollout.rollout_id))
     return [found[index] for index in range(len(answers))]
 
 
-async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:
+def run_of(settings: RewardSettings) -> str:
+    """Return the id of the run that all requests with these coefficients share."""
+    if settings == PAPER:
+        return RUN_ID
+    return f"{RUN_ID}-{hashlib.sha256(repr(settings).encode()).hexdigest()[:8]}"
+
+
+async def _executed(runs: Runs, batch: Batch, settings: RewardSettings) -> dict[str, Outcome]:
     """Return the outcome of each rollout. Cancel the batch on timeout, or if the client disconnects."""
-    await runs.open_run("rewards over HTTP", RUN_ID, TERMS)
+    await runs.open_run("rewards over HTTP", batch.run_id, RunTerms(GroupPolicy.PARTIAL, reward=settings))
     log = await runs.submit(batch)
     try:
         async with asyncio.timeout(LONGEST_S):
