@@ -64,7 +64,12 @@ async def test_address_names_coefficients_and_requests_with_equal_ones_share_a_r
     ):
         answers = [
             await http.post(f"{REWARDS}{query}", json=asked("move 3", "I can't."))
-            for query in ("?goal=10&unparsable=-2", "?unparsable=-2.0&goal=10.0", "?unparsable=-3", "?goal=30")
+            for query in (
+                "?goal=10&unparsable=-2",
+                "?unparsable=-2.0&goal=10.0",
+                "?unparsable=-3",
+                "?goal=30",
+            )
         ]
         runs = {run["run_id"] for run in (await http.get("/api/v1/runs")).json()["items"]}
         refused = [

@@ -137,6 +137,18 @@ def test_without_a_kl_term_there_is_no_reference():
     assert full.total(Phase.UPDATE) - without.total(Phase.UPDATE) == 4000
 
 
+def test_with_a_model_server_the_trainer_scores_its_plans_and_samples_nothing():
+    served = plan(sampler__url="http://localhost:8000", grpo__kl_coef=0.0)
+    alone = plan(grpo__kl_coef=0.0)
+    assert set(alone.parts) - set(served.parts) == {Phase.EVALUATION}
+    scored = footprint(precision_of(settings(), casts=False)).scored(
+        Batch(1, settings().grpo.group, 30, settings().grpo.max_new)
+    )
+    assert served.parts[Phase.SAMPLING][Part.CACHE] == scored.cache
+    assert served.parts[Phase.SAMPLING][Part.ACTIVATIONS] == scored.activations
+    assert served.parts[Phase.UPDATE] == alone.parts[Phase.UPDATE]
+
+
 def test_imitation_has_no_reference_and_muon_one_moment():
     parts = plan(imitation__patience=2).parts[Phase.IMITATION]
     assert parts[Part.REFERENCE] == 0

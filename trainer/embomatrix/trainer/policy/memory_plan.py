@@ -40,7 +40,7 @@ class Phase(StrEnum):
 
     IMITATION = "imitation"
     EVALUATION = "evaluation"
-    SAMPLING = "sampling"  # with the scores under the reference policy
+    SAMPLING = "sampling"  # with the scores under the reference policy, and of what a model server sampled
     UPDATE = "update"
     STEP = "optimiser step"
     CHECKPOINT = "checkpoint"
@@ -85,7 +85,10 @@ class Advice:
 
 
 def plan_memory(settings: TrainSettings, footprint: Footprint, lengths: Lengths) -> MemoryPlan:
-    """Return the peaks of a run in which every prompt is the longest one and every plan uses all tokens that it may."""
+    """Return the peaks of a run in which every prompt is the longest one and every plan uses all tokens that it may.
+
+    With a model server the trainer samples and evaluates nothing; it scores what the server sampled.
+    """
     imitation, grpo, evaluation = settings.imitation, settings.grpo, settings.evaluation
     new = grpo.max_new
     gradients = footprint.learning * FLOAT32
@@ -107,12 +110,16 @@ def plan_memory(settings: TrainSettings, footprint: Footprint, lengths: Lengths)
         "optimiser": moments,
         "reference": footprint.reference if grpo.kl_coef else 0,
     }
-    samples = max(evaluation.samples, evaluation.samples_during if evaluation.every else 0)
-    usage = footprint.sampled(Batch(evaluation.chunk, samples, lengths.prompt, new))
-    parts[Phase.EVALUATION] = _parts(usage, **held)
+    is_served = bool(settings.sampler.url)
+    if not is_served:
+        samples = max(evaluation.samples, evaluation.samples_during if evaluation.every else 0)
+        usage = footprint.sampled(Batch(evaluation.chunk, samples, lengths.prompt, new))
+        parts[Phase.EVALUATION] = _parts(usage, **held)
     size = min(grpo.chunk, grpo.tasks_per_step)
     batch = Batch(size, grpo.group, lengths.prompt, new)
-    passes = [footprint.sampled(batch), *([footprint.scored(batch)] if grpo.kl_coef else [])]
+    passes = [] if is_served else [footprint.sampled(batch)]
+    if grpo.kl_coef or is_served:
+        passes.append(footprint.scored(batch))
     parts[Phase.SAMPLING] = _parts(max(passes, key=lambda usage: usage.total), **held)
     usage = footprint.learnt(batch, entropy=grpo.entropy_coef > 0)
     earlier = gradients if grpo.tasks_per_step > size or grpo.reserve else 0
