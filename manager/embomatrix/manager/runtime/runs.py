@@ -102,6 +102,10 @@ class Runs:
         self._runs: dict[str, RunRow] = {}
         self._heard_s: dict[str, float] = {}
         self._submissions = Submissions(self._feed)
+        self._opening_or_closing = asyncio.Lock()
+        """Held while a run is opened or closed: a run that is opened anew must not lose its row to the end of the old one."""
+        self._still_stored: dict[str, RunStats] = {}
+        """Counters of closed runs that the store has not deleted yet."""
 
     @property
     def open(self) -> Mapping[str, RunRow]:
@@ -155,21 +159,27 @@ class Runs:
                 f"run id {run_id[:140]!r}: use up to 128 letters, digits, '.', '_' and '-'"
             )
         if run_id not in self._runs:
-            if len(self._runs) >= RUNS:
-                raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
-            run = RunRow(run_id, printable(name[:200]), terms_payload(terms))
-            with _store_errors():
-                await self._store.open_run(run)
-            if run_id not in self._runs:
-                self._runs[run_id] = run
-                self._feed(RunOpened(run_id, terms))
-            self._history.opened(run_id, run.name, terms.reward)
-        elif terms.reward not in (PAPER, terms_of(self._runs[run_id]).reward):
+            async with self._opening_or_closing:
+                await self._open_new(run_id, name, terms)
+        if terms.reward not in (PAPER, terms_of(self._runs[run_id]).reward):
             raise ConflictError(
                 f"run {run_id!r} was opened with other reward coefficients: keep those, or open another run"
             )
         self._heard_s[run_id] = time.monotonic()
         return run_id
+
+    async def _open_new(self, run_id: str, name: str, terms: RunTerms) -> None:
+        if run_id in self._runs:  # another call opened it during the wait for the lock
+            return
+        if len(self._runs) >= RUNS:
+            raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
+        await self._forget_stored(run_id)
+        run = RunRow(run_id, printable(name[:200]), terms_payload(terms))
+        with _store_errors():
+            await self._store.open_run(run)
+        self._runs[run_id] = run
+        self._feed(RunOpened(run_id, terms))
+        self._history.opened(run_id, run.name, terms.reward)
 
     def announce(
         self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]
@@ -253,20 +263,36 @@ class Runs:
         self._feed(BatchCancelled(run_id, batch_id))
 
     async def close_run(self, run_id: str) -> RunStats:
-        """Close the run and discard its results. Return its counters."""
-        self.touch(run_id)
-        del self._runs[run_id], self._heard_s[run_id]
-        leads = self._history.leads(run_id)
-        stats, commands = self._cluster.close_run(run_id, now_s=time.monotonic())
-        self._logs.close_run(run_id)
-        self._carry_out(commands)
-        await self._history.closed(run_id, stats, leads)
-        with _store_errors():
-            await self._store.close_run(run_id)
-        return stats
+        """Close the run and discard its results. Return its counters.
+
+        After an UnavailableError of the store the call may be repeated.
+        """
+        async with self._opening_or_closing:
+            if run_id not in self._still_stored:
+                self.touch(run_id)
+                del self._runs[run_id], self._heard_s[run_id]
+                leads = self._history.leads(run_id)
+                stats, commands = self._cluster.close_run(run_id, now_s=time.monotonic())
+                self._still_stored[run_id] = stats
+                self._logs.close_run(run_id)
+                self._carry_out(commands)
+                await self._history.closed(run_id, stats, leads)
+            stats = self._still_stored[run_id]
+            await self._forget_stored(run_id)
+            return stats
+
+    async def _forget_stored(self, run_id: str) -> None:
+        """Delete a closed run from the store, unless that was done."""
+        if run_id in self._still_stored:
+            with _store_errors():
+                await self._store.close_run(run_id)
+            del self._still_stored[run_id]
 
     async def close_idle(self, now_s: float) -> None:
-        """Close runs whose trainers disappeared."""
+        """Close runs whose trainers disappeared, and delete closed ones that the store could not delete."""
+        for run_id in list(self._still_stored):
+            with contextlib.suppress(UnavailableError, NotFoundError):
+                await self.close_run(run_id)
         for run_id, heard_s in list(self._heard_s.items()):
             if now_s - heard_s > IDLE_S and not self._cluster.dispatcher.pending_of(run_id):
                 logger.info("closing idle run run=%s", run_id)
