@@ -50,7 +50,7 @@ class BundleCache:
             return cached
         for _ in range(2):
             data = await self._fetch(digest)
-            found = bundle_digest(data)
+            found = await asyncio.to_thread(bundle_digest, data)
             if found == digest:
                 return await asyncio.to_thread(self._keep, digest, data)
             logger.warning("bundle damaged in transit bundle=%s found=%s", digest, found)

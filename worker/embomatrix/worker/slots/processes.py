@@ -13,12 +13,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.host.limits import MIB
 from embomatrix.sim.zygote import PREFIX_BYTES, PipeMessage, frame_lengths, pack, unpack
 
 if TYPE_CHECKING:
     from embomatrix.worker.slots.slot_program import ProgressBoard
 
 SIMULATOR_PROGRAM: Final = (sys.executable, "-m", "embomatrix.worker.slots.physics")
+LOG_BYTES: Final = 10 * MIB
+"""The engine's output begins anew at a start beyond this size."""
+LAST_BYTES: Final = 4_096
+"""End of the output in which the last line is looked for."""
 START_S: Final = 60.0
 """Limit for a root to import the engine on a busy machine."""
 ENVIRONMENT: Final = {
@@ -288,6 +293,7 @@ async def start_root(
     Slots write their progress to the ``board``, if there is one. The output of the engine goes to ``log``, because Bullet
     writes warnings to standard output.
     """
+    await asyncio.to_thread(_shorten, log)
     ours, theirs = socket.socketpair()
     shared = () if board is None else (board.fd,)
     with theirs, log.open("ab") as output:
@@ -318,8 +324,16 @@ async def start_root(
     return Root(peer, process, float(answer.header["memory_mb"]))
 
 
+def _shorten(log: Path) -> None:
+    """Empty a long output, which nothing else bounds."""
+    if log.exists() and log.stat().st_size > LOG_BYTES:
+        os.truncate(log, 0)
+
+
 def _last_line(log: Path) -> str:
-    lines = log.read_text(errors="replace").strip().splitlines()
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - LAST_BYTES))
+        lines = file.read().decode(errors="replace").strip().splitlines()
     return lines[-1] if lines else ""
 
 

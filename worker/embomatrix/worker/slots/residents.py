@@ -36,6 +36,8 @@ LOAD_S: Final = 60.0
 """Limit for fetching and loading one scene."""
 RETRY_LOAD_S: Final = 5.0
 """Interval between attempts to load a failing scene that is still wanted."""
+KNOWN_SCENES: Final = 8_192
+"""Scenes whose memory is remembered after they were evicted."""
 SLOT_MB: Final = 8.0
 IDLE_MEMORY_SHARE: Final = 0.25
 """Share of the worker's memory for idle processes of about 8 MB each. Scenes return step after step, and a kept process saves a
@@ -278,6 +280,8 @@ class Residents:
         else:
             scene.state, scene.load_s = ResidentState.WARM, time.monotonic() - started_s
             self._known_mb[scene.digest] = scene.memory_mb
+            while len(self._known_mb) > KNOWN_SCENES:
+                del self._known_mb[next(iter(self._known_mb))]
             logger.info(
                 "scene warm scene=%s in %.0f ms, %.1f MB", scene.digest, scene.load_s * 1e3, scene.memory_mb
             )
