@@ -1,5 +1,6 @@
 """Physical mode: the robot carries out every skill once in the flat and reports failures."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,8 +10,10 @@ from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 from tests.fakes.skill_reasons import MISHAPS, reasons_of
 
 from embomatrix.sim.physical.actor import MOTIONS, PhysicalActor, physical_simulator
+from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.parse import parse_plan
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
@@ -67,6 +70,33 @@ def test_door_that_an_obstacle_stops_is_shut_after_the_failed_attempt(simulator_
     simulator.close()
     assert trace.failure in {FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED}
     assert not is_open
+
+
+@pytest.mark.parametrize("during", ["pick_up apple_1", "move countertop_1", "place countertop_1 ontop"])
+def test_object_that_slips_lies_where_it_fell_and_the_hand_is_empty(flat, monkeypatch, during):
+    acting = PhysicalActor.act
+
+    def act(actor, world, call, rng):
+        slips = call.skill == during.split()[0] and (call.skill != Skill.MOVE or bool(world.carried))
+        with monkeypatch.context() as patch:
+            if slips:
+                patch.setattr(PhysicalStage, "has_slipped", lambda stage: stage.grip is not None)
+            return acting(actor, world, call, rng)
+
+    monkeypatch.setattr(PhysicalActor, "act", act)
+    plan = "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop"
+    trace = executed(flat, plan)
+    assert (trace.failure, len(trace.steps)) == (FailureReason.SLIPPED, plan.split("; ").index(during) + 1)
+    engine, dynamic = flat.world.engine, flat._actor._stage.dynamic
+    assert flat.world.carried == ()
+    assert not engine.is_parked("apple_1")
+    lies, fell = (bodies.pose("apple_1").position_m for bodies in (engine, dynamic.bodies))
+    assert math.dist(lies, fell) < 0.01
+    monkeypatch.undo()
+    index = [item.name for item in flat.world.scene.objects].index("apple_1")
+    for call in parse_plan(f"move {index}\npick_up {index}"):
+        step = flat.run_step(call)
+        assert step.failure not in (FailureReason.HAND_FULL, FailureReason.SLIPPED), step.message
 
 
 def test_food_is_taken_out_of_the_opened_fridge(flat):

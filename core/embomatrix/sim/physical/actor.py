@@ -66,6 +66,8 @@ class PhysicalActor:
         """Carry out a call whose preconditions hold, let the world settle, and copy moved objects to the planning scene."""
         assert self._stage is not None
         refusal = MOTIONS[call.skill](self._stage, call, rng)
+        if refusal is not None and refusal.reason is FailureReason.SLIPPED:
+            self._stage.drop()
         self._stage.settle()
         return refusal
 

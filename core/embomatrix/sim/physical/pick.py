@@ -49,8 +49,7 @@ def pick_up(stage: PhysicalStage, target: str) -> SkillRefusal | None:
     if refusal is None and stage.has_slipped():
         refusal = refuse(FailureReason.SLIPPED, target=target)
     if refusal is not None and stage.grip is not None:
-        stage.release()
-        stage.settle()
+        stage.drop()
     return refusal
 
 
@@ -114,8 +113,7 @@ def _lift(stage: PhysicalStage, path: ArmPath, target: str, by_m: float) -> Skil
     if hit is None:
         stage.mover.advance(raised(path.postures[-3::-1], by_m))
     if stage.has_slipped():
-        stage.release()
-        world.hand.let_go(stage.dynamic.bodies.pose(target))
+        stage.drop()
         return refuse(FailureReason.SLIPPED, target=target)
     return None
 

@@ -222,17 +222,7 @@ def _set_down(stage: PhysicalStage, path: ArmPath) -> SkillRefusal | None:
     )
     stage.loosen()
     stage.mover.wait(16)
-    _let_go(stage)
+    stage.leave()
     stage.mover.advance(path.postures[key + 1 :], 0.5)
     stage.dynamic.part_from(name)
     return None
-
-
-def _let_go(stage: PhysicalStage) -> None:
-    """Add the object and its contents to the planning scene at their present poses."""
-    world = stage.world
-    group = world.carried
-    world.hand.forget()
-    for name in group:
-        world.engine.set_pose(name, stage.dynamic.bodies.pose(name))
-    world.navigator.refresh()

@@ -190,6 +190,20 @@ class PhysicalStage:
         self.dynamic.loosen()
         self.grip = None
 
+    def leave(self) -> None:
+        """Add the object that left the hand, and its contents, to the planning scene where they are now."""
+        group = self.world.carried
+        self.world.hand.forget()
+        for name in group:
+            self.world.engine.set_pose(name, self.dynamic.bodies.pose(name))
+        self.world.navigator.refresh()
+
+    def drop(self) -> None:
+        """Let go of an object that slipped: the hand is empty, and what fell can be picked up where it came to rest."""
+        self.release()
+        self.dynamic.settle(SETTLE_STEPS)
+        self.leave()
+
     def has_slipped(self) -> bool:
         """True if the held object has moved in the hand."""
         if self.grip is None:
