@@ -114,7 +114,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self._message = ""
         return self._observed(self._episode), {
             "task_id": self._episode.task.task_id,
-            "rooms": self._episode.situation.rooms,
+            "rooms": self._episode.situation.home,
             "objects": self._episode.task.table,
             "action_mask": mask_of(self._episode),
         }
@@ -162,7 +162,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             )
         for name, space in self._calls.spaces.items():
             _check_number(name, action[name], int(space.n) if isinstance(space, spaces.Discrete) else None)
-        return call_of(action, episode.situation.rooms)
+        return call_of(action, episode.situation.home)
 
     def render(self) -> str | NDArray[np.uint8] | None:
         """State in words, or a picture of the robot's room, by ``render_mode``. Raises EngineError without pybullet."""
@@ -196,9 +196,14 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
 def mask_of(episode: Episode) -> dict[str, Any]:
     """Mask of the action space: skills of the task's profile, rows of its table and rooms of its scene."""
+    if len(episode.situation.home) > MOST_ROOMS:
+        raise ValueError(
+            f"the scene {episode.task.scene_id} has {len(episode.situation.home)} rooms: at most {MOST_ROOMS} fit into the "
+            "action space; play it with embomatrix.envs.make, which takes texts"
+        )
     rows = (np.arange(MAX_TABLE) < len(episode.task.table)).astype(np.int8)
     skills = np.array([skill in PROFILES[episode.task.profile] for skill in SKILLS], dtype=np.int8)
-    rooms = (np.arange(MOST_ROOMS) < len(episode.situation.rooms)).astype(np.int8)
+    rooms = (np.arange(MOST_ROOMS) < len(episode.situation.home)).astype(np.int8)
     everything = np.ones(len(RELATIONS), dtype=np.int8)
     return {
         "skill": skills,

@@ -16,7 +16,7 @@ from embomatrix.sim.live_world import LiveWorld, WorldMark
 from embomatrix.sim.sight import rows_in_sight
 from embomatrix.sim.state.sources import Change
 from embomatrix.skills.check import check
-from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
+from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained, lines_of
 from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.skills.trace import Step, Trace
 from embomatrix.skills.turns import TurnObservation
@@ -297,7 +297,7 @@ class Simulator:
 
     def survey(self, task: Task) -> tuple[str, ...]:
         """State in words of every object in the task's table, in its order; it reveals nothing about the goal."""
-        return final_lines([self._description(name) for name in task.table])
+        return lines_of(self._description(name) for name in task.table)
 
     def observe(self, task: Task, before: WorldMark, *, sight: bool = False) -> TurnObservation:
         """Describe the present state and what has changed since another state of this task.
@@ -305,11 +305,9 @@ class Simulator:
         With ``sight``, say which rows of the table the robot sees.
         """
         changed = self.world.mark().changed_since(before)
-        descriptions = [self._description(name) for name in task.table if name in changed]
+        changes = lines_of(self._description(name) for name in task.table if name in changed)
         sees = rows_in_sight(self.world) if sight else ()
-        return TurnObservation(
-            self.world.robot_room, self.world.carried, final_lines(descriptions), sight, sees
-        )
+        return TurnObservation(self.world.robot_room, self.world.carried, changes, sight, sees)
 
     def warm_up(self) -> Iterator[None]:
         """Compute cached values ahead of their first use, a little per step. Changes no answer.

@@ -164,6 +164,7 @@ class TransitionTree(Generic[T]):
     def _run(self, node: _Node[T], call: SkillCall, seed: int) -> _Node[T]:
         """Execute a call at the simulator's present node."""
         simulator = self._simulator
+        self._here = None  # unknown if the simulator raises
         step = simulator.run_step(call)
         before = None if step.ok else node.mark
         mark = simulator.mark() if before is None else simulator.mark_after_failure(before)
@@ -193,6 +194,7 @@ class TransitionTree(Generic[T]):
             if not node.drawn:
                 self._simulator.draw_from(seed)
             return
+        self._here = None  # unknown if the simulator raises
         if node.mark is not None:
             self._simulator.return_to(node.mark, seed)
         else:

@@ -1,7 +1,7 @@
 """Observations in words: the effect of a step, and the final state of objects."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -117,6 +117,11 @@ def read_line(text: str) -> ObjectDescription:
         held=found["hand"] is not None,
         states=tuple(found["states"].split(", ")[1:]),
     )
+
+
+def lines_of(described: Iterable[ObjectDescription]) -> tuple[str, ...]:
+    """Describe objects, one a line."""
+    return tuple(map(line, described))
 
 
 def final_lines(described: Sequence[ObjectDescription]) -> tuple[str, ...]:

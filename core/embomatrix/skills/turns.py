@@ -72,8 +72,7 @@ class TurnObservation:
     held: tuple[str, ...]
     """Object in the robot's hand, then its contents; empty for an empty hand."""
     changes: tuple[str, ...]
-    """One line for each object of the task's table that the turn has changed or moved, in the table's order, as ``final_lines``
-    writes them."""
+    """One line for each object of the task's table that the turn has changed or moved, in the table's order."""
     looked: bool = False
     """True in episodes with sight: ``sees`` is set."""
     sees: tuple[int, ...] = ()

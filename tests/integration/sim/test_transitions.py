@@ -11,9 +11,11 @@ from tests.fakes.scenes import kitchen_scene
 from tests.integration.sim.test_household import CALLS
 
 from embomatrix.reward.hierarchy import score
+from embomatrix.sim.engine import EngineError
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.sim.transitions import TransitionTree
+from embomatrix.skills.describe import MAX_FINAL_LINES
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.goal import Atom
 
@@ -75,6 +77,35 @@ def test_equal_prefixes_are_executed_once(home, task):
         done = []
         counts.append((tree.execute(task, plan, 0, done.append)[2], done))
     assert counts == [(0, [1, 2, 3, 4]), (2, [2, 3, 4]), (4, [4]), (1, [1])]
+
+
+def test_state_is_unknown_after_an_error_of_the_simulator(home, task, monkeypatch):
+    tree = tree_of(home[0])
+    first = plan_of(task, "move rag_1; pick_up rag_1")
+    tree.execute(task, first, 0)
+    run_step, calls = home[0].run_step, []
+
+    def breaks(call):
+        calls.append(call)
+        step = run_step(call)
+        if len(calls) == 1:
+            raise EngineError("the engine is gone")
+        return step
+
+    monkeypatch.setattr(home[0], "run_step", breaks)
+    longer = plan_of(task, "move rag_1; pick_up rag_1; move sink_1; place sink_1 inside")
+    with pytest.raises(EngineError):
+        tree.execute(task, longer, 0)
+    monkeypatch.undo()
+    trace, judged, _ = tree.execute(task, longer, 0)
+    assert (trace, judged) == plain(home[1], task, longer, 0)
+
+
+def test_every_object_of_a_long_table_is_described(home, task):
+    simulator = home[0]
+    simulator.reset(task, 0)
+    assert len(task.table) > MAX_FINAL_LINES
+    assert [line.partition(":")[0] for line in simulator.survey(task)] == list(task.table)
 
 
 def test_seeds_share_the_calls_before_the_first_that_draws(home, task):

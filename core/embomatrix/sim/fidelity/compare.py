@@ -149,7 +149,9 @@ def compare(cached: Simulator, physical: Simulator, task: Task, trial: FidelityT
 def objects_in(task: Task, plan: Plan) -> tuple[str, ...]:
     """Return the objects of the goal and of the calls, in table order. Indices outside the table are ignored."""
     rows = {row for call in plan for row in (call.object_index, call.source_index) if row is not None}
-    named = objects_of(task.goal, task.types) | {task.table[row] for row in rows if row < len(task.table)}
+    named = objects_of(task.goal, task.types) | {
+        task.table[row] for row in rows if 0 <= row < len(task.table)
+    }
     return tuple(name for name in task.table if name in named)
 
 
