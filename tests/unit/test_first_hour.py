@@ -61,8 +61,10 @@ def test_record_keeps_seeds_of_the_same_tasks(tmp_path: Path) -> None:
     add_to_record(path, [seed(1, 7), seed(0, 12)])
     assert add_to_record(path, [seed(2, 5), seed(1, 9)]) == [seed(0, 12), seed(1, 9), seed(2, 5)]
     assert add_to_record(path, []) == list(read_record(path)) == [seed(0, 12), seed(1, 9), seed(2, 5)]
-    other = replace(seed(2, 5), dataset="d2")
-    assert add_to_record(path, [other]) == [other]
+    before = path.read_bytes()
+    with pytest.raises(BenchError, match=r"of different datasets \(d1, d2\): name another file"):
+        add_to_record(path, [replace(seed(2, 5), dataset="d2")])
+    assert path.read_bytes() == before
 
 
 def test_shipped_record_is_readable() -> None:

@@ -22,6 +22,7 @@ from embomatrix.bench.fidelity.suite import DISAGREEMENTS_FILE, RESULTS_FILE, Fi
 from embomatrix.bench.peers.contest import PeerSizes, bench_peers
 from embomatrix.bench.report.figures import (
     RESULT_MARK,
+    BenchError,
     BenchResult,
     describe_machine,
     merge_parts,
@@ -343,7 +344,9 @@ def fidelity(
     """Run the same plans in cached and in physical mode and compare; resumes an interrupted suite."""
     with refusals(json_file):
         found = Dataset.load(dataset or (PINNED if quick else FULL_SUITE))
-        settings = QUICK if quick else FidelitySettings(plans, calls, seed)
+        if quick and (plans, calls) != (1_000, 200):
+            raise BenchError("--quick has its own numbers of plans and calls: leave out --plans and --calls")
+        settings = replace(QUICK, seed=seed) if quick else FidelitySettings(plans, calls, seed)
         folder = out or Path("build/fidelity-quick" if quick else "build/fidelity")
         hand_in(_fidelity(found, settings, folder, jobs), json_file)
 

@@ -134,7 +134,11 @@ class Endpoint:
 
     async def _attempt(self, body: dict[str, Any]) -> dict[str, Any] | _Failure:
         try:
-            async with self._http.stream("POST", self._url, json=body) as response:
+            # httpx's own timeouts start anew with each byte.
+            async with (
+                asyncio.timeout(self._limits.timeout_s),
+                self._http.stream("POST", self._url, json=body) as response,
+            ):
                 data = bytearray()
                 async for part in response.aiter_bytes():
                     data += part
@@ -142,9 +146,9 @@ class Endpoint:
                         return _Failure(
                             f"it answered with more than {MAX_REPLY_BYTES} bytes", transient=False
                         )
-        except httpx.TimeoutException:
+        except (httpx.TimeoutException, TimeoutError):
             return _Failure(f"it gave no answer within {self._limits.timeout_s:g} s", transient=True)
-        except (httpx.TransportError, httpx.StreamError) as error:
+        except (httpx.RequestError, httpx.StreamError) as error:
             return _Failure(f"it can't be reached ({error or type(error).__name__})", transient=True)
         except httpx.InvalidURL as error:
             return _Failure(f"this is not a valid address ({error})", transient=False)

@@ -39,9 +39,15 @@ def content_digest(dataset: Dataset) -> str:
 
 def pack(dataset: Dataset, file: Path) -> str:
     """Write a dataset into one file and return its content digest. Raises DatasetError or OSError."""
-    with lzma.open(file, "wb", filters=_FILTERS) as out:
-        for piece in _pieces(dataset):
-            out.write(piece)
+    # Beside the file: an interrupted command leaves the old one whole.
+    part = file.with_name(f"{file.name}.partial")
+    try:
+        with lzma.open(part, "wb", filters=_FILTERS) as out:
+            for piece in _pieces(dataset):
+                out.write(piece)
+        part.replace(file)
+    finally:
+        part.unlink(missing_ok=True)
     return content_digest(dataset)
 
 

@@ -206,6 +206,8 @@ def unpacked_tasks(parts: Sequence[int] = tuple(PARTS)) -> Path:
         # Two commands may unpack at once; a command that is interrupted leaves no half dataset.
         with tempfile.TemporaryDirectory(dir=folder.parent) as fresh:
             unpack(Path(fresh) / folder.name, parts)
+            if (folder / TASKS_FILE).exists():  # another command was faster, and may be reading it
+                return folder
             shutil.rmtree(folder, ignore_errors=True)
             try:
                 (Path(fresh) / folder.name).replace(folder)

@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import contextlib
 from dataclasses import replace
 
 import pytest
@@ -112,6 +113,30 @@ async def test_missing_answer_times_out():
     limits = EndpointLimits(attempts=2, timeout_s=0.1, first_wait_s=0.01)
     with pytest.raises(EndpointError, match=r"gave no answer within 0.1 s, 2 times"):
         await asked(ChatServer(slow), limits=limits)
+
+
+async def test_answer_that_trickles_in_times_out():
+    async def trickle(reader, writer):
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: 1000\r\n\r\n")
+        with contextlib.suppress(ConnectionError):
+            while True:
+                writer.write(b" ")
+                await writer.drain()
+                await asyncio.sleep(0.02)
+
+    server = await asyncio.start_server(trickle, "127.0.0.1", 0)
+    address = "http://{}:{}/v1".format(*server.sockets[0].getsockname())
+    limits = EndpointLimits(attempts=1, timeout_s=0.3)
+    async with server, Endpoint(address, "small-1", limits=limits) as endpoint:
+        with pytest.raises(EndpointError, match=r"gave no answer within 0.3 s"):
+            await asyncio.wait_for(endpoint.complete(QUESTION), 10)
+
+
+async def test_damaged_compression_is_a_failure_of_the_endpoint():
+    broken = (200, {"content-encoding": "gzip"}, b"no gzip", 0.0)
+    with pytest.raises(EndpointError, match=r"can't be reached .*, 3 times"):
+        await asked(ChatServer(broken))
 
 
 async def test_oversized_answer_is_refused():

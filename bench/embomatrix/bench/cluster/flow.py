@@ -48,7 +48,7 @@ REDIS_OPTIONS: Final = ("--appendonly", "yes", "--maxmemory-policy", "noeviction
 class FlowSizes:
     """Batches of ``in_flight`` rollouts, the next submitted before the last is done.
 
-    The manager's memory is measured with ``most`` rollouts in flight; 0 leaves that out.
+    The manager's memory is measured with ``most`` rollouts in flight too. The flow through Redis is measured without it (0).
     """
 
     slots: int = 2

@@ -186,6 +186,8 @@ def table(
     ],
     samples: Annotated[int, typer.Option(min=1, max=1000, help="Plans of each task.")] = 10,
     manager: _Manager = "",
+    token: _Token = "",
+    ca: _Ca = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Simulator processes without a manager.")] = None,
     json_file: _Json = None,
     page: _Page = None,
@@ -196,7 +198,7 @@ def table(
         machine, commit = describe_machine(), commit_here()
         lines: list[str] = []
         figures: list[Figure] = []
-        where = f"--manager={manager}" if manager else f"--jobs={jobs or usable_cores()}"
+        where = _connection(manager, token, ca) or (f"--jobs={jobs or usable_cores()}",)
         for name in bench:
             for stage in stages:
                 console.rule(f"{name}: {stage.label}")
@@ -207,7 +209,7 @@ def table(
                     f"--samples={samples}",
                     f"--out={out}",
                 )
-                run_command("experiment", no_problem, "eval", *options, where)
+                run_command("experiment", no_problem, "eval", *options, *where)
             table_lines, success = bench_table(run, name, stages)
             lines += table_lines
             figures += success
@@ -230,9 +232,13 @@ def _venue(
 ) -> AbstractContextManager[Venue]:
     if not manager:
         return own_venue(out, workers, slots=1)
-    options = {"manager": manager, "token": token, "ca": ca}
-    arguments = tuple(f"--{name}={value}" for name, value in options.items() if value)
-    return contextlib.nullcontext(Venue(arguments, no_problem))
+    return contextlib.nullcontext(Venue(_connection(manager, token, ca), no_problem))
+
+
+def _connection(manager: str, token: str, ca: Path | None) -> tuple[str, ...]:
+    """Return the options that name a manager; none without one."""
+    options = {"manager": manager, "token": token, "ca": ca} if manager else {}
+    return tuple(f"--{name}={value}" for name, value in options.items() if value)
 
 
 def _conduct(

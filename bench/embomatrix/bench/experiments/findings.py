@@ -10,7 +10,7 @@ import numpy as np
 
 from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE, Design
 from embomatrix.pages.figures import Better, Figure, Interval
-from embomatrix.trainer.evaluation.intervals import bootstrap, mean_difference
+from embomatrix.trainer.evaluation.intervals import bootstrap, mean_difference, over_seeds_and_tasks
 from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 
@@ -75,7 +75,7 @@ def findings_of(name: str, runs: Sequence[Run]) -> ArmFindings:
         tuple(runs),
         bootstrap(_over_seeds(before)),
         bootstrap(_over_seeds(after)),
-        mean_difference(_over_seeds(gains)),
+        _interval(gains),
     )
 
 
@@ -87,6 +87,13 @@ def difference(first: ArmFindings, other: ArmFindings) -> Interval:
         for run in other.runs
         if run.seed in known and (now := by_task(run.outcome.after))
     ]
+    return _interval(differences)
+
+
+def _interval(differences: Sequence[Mapping[str, float]]) -> Interval:
+    """Mean of differences by seed and task, with an interval over both; over tasks alone if there is one seed."""
+    if len(differences) > 1:
+        return over_seeds_and_tasks(differences)
     return mean_difference(_over_seeds(differences))
 
 

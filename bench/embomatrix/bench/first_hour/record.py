@@ -62,10 +62,15 @@ class SeedRun:
 
 
 def add_to_record(path: Path, seeds: Sequence[SeedRun]) -> Sequence[SeedRun]:
-    """Add seeds to those that a file holds of the same tasks, and return all in their order. Raise BenchError and OSError."""
-    tasks = {seed.dataset for seed in seeds}
-    kept = {seed.seed: seed for seed in read_record(path) if not tasks or seed.dataset in tasks}
-    merged = kept | {seed.seed: seed for seed in seeds}
+    """Add seeds to those in a file, and return all in their order. Raise OSError, and BenchError for those of other tasks."""
+    kept = read_record(path)
+    datasets = sorted({seed.dataset for seed in (*kept, *seeds)})
+    if len(datasets) > 1:
+        raise BenchError(
+            f"the seeds in {path} and the new ones are of different datasets ({', '.join(datasets)}): name another file with "
+            "--record"
+        )
+    merged = {seed.seed: seed for seed in (*kept, *seeds)}
     ordered = [merged[number] for number in sorted(merged)]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, (json.dumps([asdict(seed) for seed in ordered], indent=1) + "\n").encode("ascii"))
@@ -122,7 +127,7 @@ def figures_of(seeds: Sequence[SeedRun]) -> tuple[Figure, ...]:
             MOST_MINUTES,
         ),
         Figure(
-            "demo_core_minutes continued to trained",
+            "demo_cpu_time_ratio, continued imitation to GRPO",
             min(seed.continued.core_s / seed.trained.core_s for seed in seeds),
             "x",
             Better.NEITHER,

@@ -103,9 +103,14 @@ def _run(command: Sequence[str], cwd: Path | None = None, cache: Path | None = N
     given = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     if cache is not None:
         given["XDG_CACHE_HOME"] = str(cache)
-    done = subprocess.run(
-        command, cwd=cwd, env=given, capture_output=True, text=True, timeout=LIMIT_S, check=False
-    )
+    try:
+        done = subprocess.run(
+            command, cwd=cwd, env=given, capture_output=True, text=True, timeout=LIMIT_S, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise BenchError(
+            f"{' '.join(command[:4])} took longer than {LIMIT_S:g} s: try again with less beside it"
+        ) from error
     if done.returncode:
         raise BenchError(
             f"{' '.join(command[:4])} ended with status {done.returncode}: {done.stderr.strip()[-500:]}"

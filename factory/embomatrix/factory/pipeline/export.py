@@ -246,7 +246,5 @@ def _example(file_name: str) -> list[str]:
 
 def _size(count: int) -> str:
     """Return the size bracket of dataset hubs."""
-    for limit, name in ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K")):
-        if count < limit:
-            return name
-    return "n>100K"
+    brackets = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+    return next((name for limit, name in brackets if count < limit), "1M<n<10M")
