@@ -65,7 +65,7 @@ OWN: Final[Mapping[str, str]] = {
     "bench.experiments.design:_is_toml": BENCH,
     "bench.experiments.design:keep_design": BENCH,
     "bench.first_hour.record:read_record": BENCH,
-    "bench.first_hour.seeds:_read_arm": BENCH,
+    "bench.first_hour.seeds:_finished": BENCH,
     "bench.fidelity.suite:_lines": BENCH,
     "bench.fidelity.suite:_trials": BENCH,
     "bench.peers.scene_process:SceneProcess.execute": BENCH,

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from pydantic import TypeAdapter
 
 from embomatrix.bench.first_hour.record import (
     RECORD,
@@ -14,7 +15,7 @@ from embomatrix.bench.first_hour.record import (
     figures_of,
     read_record,
 )
-from embomatrix.bench.first_hour.seeds import curve_digest
+from embomatrix.bench.first_hour.seeds import FINISHED, FinishedRun, _arm, curve_digest
 from embomatrix.bench.report.figures import BenchError
 
 TASKS = [f"task-{number}" for number in range(20)]
@@ -77,6 +78,21 @@ def test_repeated_seed_is_held_against_the_record() -> None:
     assert "changed since c1" in comparison(recorded, replace(recorded, curve="other"))
     assert "other tasks" in comparison(recorded, replace(recorded, dataset="d2"))
     assert "platform is another" in comparison(recorded, replace(recorded, curve="other", platform="arm64"))
+
+
+def test_finished_run_is_kept_if_its_budgets_are_those_asked_for(tmp_path):
+    out = tmp_path / "seed-0-grpo"
+    out.mkdir()
+    ended = FinishedRun({"steps": 5}, "c1", "x86_64", 1.0, 2.0)
+    (out / FINISHED).write_bytes(TypeAdapter(FinishedRun).dump_json(ended))
+    began = []
+    assert _arm(out, 0, {"steps": 5}, began.append) == out
+    with pytest.raises(BenchError, match=r"other budgets \(steps 5, now those of the demo\)"):
+        _arm(out, 0, {}, began.append)
+    (out / FINISHED).write_text("{}")
+    with pytest.raises(BenchError, match=r"finished\.json can't be read"):
+        _arm(out, 0, {}, began.append)
+    assert not began
 
 
 def test_digest_of_a_curve_is_about_what_the_policy_did():

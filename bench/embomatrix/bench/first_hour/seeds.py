@@ -11,10 +11,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import torch
+from pydantic import TypeAdapter
 
 from embomatrix.bench.first_hour.record import Arm, SeedRun
 from embomatrix.bench.report.figures import BenchError
@@ -26,10 +28,22 @@ from embomatrix.trainer.logging.recorder import read_metrics
 
 OnStep = Callable[[str], None]
 
-COST: Final = "cost.json"
+FINISHED: Final = "finished.json"
+"""File beside a run that has finished."""
 LOG: Final = "log.txt"
 CURVE: Final = ("step", "reward", "success", "gradient_norm")
 """Figures of a step that tell two runs apart. Others may be added or renamed, and times never repeat."""
+
+
+@dataclass(frozen=True, slots=True)
+class FinishedRun:
+    """Budgets of a finished run, the code and the platform that it ran on, and its time. ``core_s``: CPU of its processes."""
+
+    options: Mapping[str, int]
+    commit: str
+    platform: str
+    wall_s: float
+    core_s: float
 
 
 def run_seed(seed: int, folder: Path, options: Mapping[str, int], on_step: OnStep) -> SeedRun:
@@ -54,16 +68,16 @@ def _read_seed(seed: int, trained: Path, continued: Path) -> SeedRun:
     if newest is None:
         raise BenchError(f"{trained} has no checkpoint: remove it, and run the command again")
     progress, _ = read_state(newest)
-    outcome = read_outcome(trained)
+    outcome, finished = read_outcome(trained), _finished(trained)
     return SeedRun(
         seed=seed,
         dataset=progress.dataset,
-        commit=commit_here(),
-        platform=platform_here(),
+        commit=finished.commit,
+        platform=finished.platform,
         curve=curve_digest(read_metrics(trained)),
         imitated=rates_by_task(outcome.before),
-        trained=_read_arm(trained, outcome),
-        continued=_read_arm(continued, read_outcome(continued)),
+        trained=_arm_of(trained, outcome),
+        continued=_arm_of(continued, read_outcome(continued)),
     )
 
 
@@ -80,7 +94,12 @@ def curve_digest(metrics: list[dict[str, Any]]) -> str:
 
 def _arm(out: Path, seed: int, options: Mapping[str, int], on_step: OnStep) -> Path:
     """Run one arm, unless its outcome is there. An unfinished one starts anew."""
-    if (out / COST).exists():
+    if (out / FINISHED).exists():
+        if (before := _finished(out).options) != options:
+            raise BenchError(
+                f"{out} was run with other budgets ({_told(before)}, now {_told(options)}): name another folder with --out, or "
+                "remove it"
+            )
         return out
     on_step(out.name)
     log = out.with_suffix(f".{LOG}")
@@ -103,13 +122,29 @@ def _arm(out: Path, seed: int, options: Mapping[str, int], on_step: OnStep) -> P
         raise BenchError(
             f"the demo of seed {seed} ended with status {started.returncode}: read {log}, and run the command again"
         )
-    cost = {"wall_s": time.monotonic() - began, "core_s": used.ru_utime + used.ru_stime}
-    (out / COST).write_text(json.dumps(cost), encoding="ascii")
+    ended = FinishedRun(
+        dict(options), commit_here(), platform_here(), time.monotonic() - began, used.ru_utime + used.ru_stime
+    )
+    (out / FINISHED).write_bytes(TypeAdapter(FinishedRun).dump_json(ended))
     return out
 
 
-def _read_arm(folder: Path, outcome: RunOutcome) -> Arm:
-    cost = json.loads((folder / COST).read_text(encoding="ascii"))
+def _told(options: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in options.items()) or "those of the demo"
+
+
+def _finished(out: Path) -> FinishedRun:
+    """Read what a finished run cost. Raise BenchError."""
+    try:
+        return TypeAdapter(FinishedRun).validate_json((out / FINISHED).read_bytes())
+    except (OSError, ValueError) as error:
+        raise BenchError(
+            f"{out / FINISHED} can't be read ({error}): remove {out}, and run the command again"
+        ) from error
+
+
+def _arm_of(folder: Path, outcome: RunOutcome) -> Arm:
+    finished = _finished(folder)
     # Without GRPO, the evaluation after imitation is the last one.
     rates = rates_by_task(outcome.after or outcome.before)
-    return Arm(rates, outcome.imitation_steps, outcome.steps, cost["wall_s"], cost["core_s"])
+    return Arm(rates, outcome.imitation_steps, outcome.steps, finished.wall_s, finished.core_s)
