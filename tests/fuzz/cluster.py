@@ -47,7 +47,7 @@ from embomatrix.manager.runtime.serialization import (
 )
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.opening import open_store
-from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, ShelfRow, StateError, readable
+from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, NamespaceRow, StateError, readable
 from embomatrix.manager.store.redis import _row as redis_row
 from embomatrix.manager.web.gallery import _parsed as layout_tree
 from embomatrix.manager.web.http_rules import HttpRules
@@ -137,12 +137,12 @@ def _result(data: bytes) -> object:
 def _credential(data: bytes) -> object:
     from embomatrix.manager.access.gate import _credential_of
 
-    book = CredentialBook([_credential_of(ShelfRow("t", data))])
+    book = CredentialBook([_credential_of(NamespaceRow("t", data))])
     return list(book.infos(now_s=1e9))
 
 
 def _reputation(data: bytes) -> object:
-    found = reputation_of(ShelfRow("w1", data))
+    found = reputation_of(NamespaceRow("w1", data))
     assert reputation_of(reputation_row("w1", found)) == found or found.disputed
     return found
 
@@ -156,7 +156,7 @@ ROWS: tuple[Callable[[bytes], object], ...] = (
     lambda data: batch_of(BatchRow("run-1", "b-1", "", data)),
     _result,
     _reputation,
-    lambda data: announced_in(ShelfRow("run-1", data)),
+    lambda data: announced_in(NamespaceRow("run-1", data)),
     lambda data: terms_of(RunRow("run-1", "a run", data)),
     _credential,
     _redis,

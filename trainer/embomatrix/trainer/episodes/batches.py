@@ -42,7 +42,7 @@ class EpisodeBatch:
 
     index: int
     planned: Sequence[PlannedEpisode]
-    """One for each task; ``SamplingRule.group`` episodes are played of each."""
+    """One for each task; ``SamplingParams.group`` episodes are played of each."""
     seed: int
 
 
