@@ -73,7 +73,7 @@ from embomatrix.rpc.wire.values import (
 )
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.worker.commands.options import parse as worker_settings
-from embomatrix.worker.link.membership import Membership, MembershipFile
+from embomatrix.worker.link.membership import Membership, MembershipFile, authority_of
 from embomatrix.worker.link.status import WorkerStatus, running_daemons
 from embomatrix.world.task import Profile
 
@@ -311,6 +311,11 @@ def _membership(data: bytes) -> object:
     return file.read()
 
 
+def _authority(data: bytes) -> object:
+    path = in_file("authority/member-x.json", data)
+    return authority_of("127.0.0.1:1", path.parent)
+
+
 def _kept_membership() -> bytes:
     file = MembershipFile(in_file("member/x", b"").parent, "secret")
     file.keep(Membership("127.0.0.1:1", "pc-1", "id.secret", b"-----BEGIN"))
@@ -445,6 +450,13 @@ def table() -> dict[str, Decoder]:
             (InvalidRequestError,),
             lambda: (_kept_membership(),),
             frozenset({"worker.link.membership:MembershipFile.read"}),
+            mutate_json,
+        ),
+        "authority of a membership": Decoder(
+            _authority,
+            (),
+            lambda: (_kept_membership(),),
+            frozenset({"worker.link.membership:authority_of"}),
             mutate_json,
         ),
         "worker status": Decoder(

@@ -111,6 +111,7 @@ OWN: Final[Mapping[str, str]] = {
     "worker.slots.processes:ProcessChannel.receive": CHILD,
     "worker.slots.slot_program:ProgressBoard.steps": CHILD,
     "worker.slots.slot_program:_answer": CHILD,
+    "cli.doctor.app:_joined_authority": WRITTEN,
     "cli.doctor.worker:worker": WRITTEN,
     "factory.commands.inspection:_tree_in": WRITTEN,
     "manager.access.certificates:make_server_certificate": WRITTEN,

@@ -67,7 +67,10 @@ class MembershipFile:
 def authority_of(manager: str, folder: Path) -> bytes:
     """Return the authority of a manager that a worker of this machine has joined; empty without one."""
     for path in sorted(folder.expanduser().glob("member-*.json")):
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        # Whoever joins with a damaged file is told of it; here it is no reason to check nothing.
+        with contextlib.suppress(
+            OSError, ValueError, KeyError, TypeError, AttributeError, InvalidRequestError
+        ):
             kept = parse_json(path.read_bytes())
             if manager in Managers(kept["manager"]).addresses:
                 return bytes(kept["ca"].encode("ascii"))
