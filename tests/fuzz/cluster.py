@@ -47,7 +47,7 @@ from embomatrix.manager.runtime.serialization import (
 )
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.opening import open_store
-from embomatrix.manager.store.protocol import BatchRow, ResultRow, RunRow, NamespaceRow, StateError, readable
+from embomatrix.manager.store.protocol import BatchRow, NamespaceRow, ResultRow, RunRow, StateError, readable
 from embomatrix.manager.store.redis import _row as redis_row
 from embomatrix.manager.web.gallery import _parsed as layout_tree
 from embomatrix.manager.web.http_rules import HttpRules
