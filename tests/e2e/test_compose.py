@@ -160,7 +160,7 @@ def test_trainer_container_trains_on_tasks_built_in_a_container(cluster, tmp_pat
         "--out=/runs/check",
     )
     assert "success" in result.stdout
-    assert "0 lost and masked" in " ".join(result.stdout.split())
+    assert "0 lost by the infrastructure" in " ".join(result.stdout.split())
     assert sum(worker["completed"] for worker in cluster.status("/api/v1/workers")["items"]) > 0, (
         "no container executed anything"
     )

@@ -67,7 +67,7 @@ def test_rollouts_of_a_killed_worker_are_redispatched_and_none_is_lost(run):
     assert [line["step"] for line in run.metrics] == list(range(1, STEPS + 1))
     assert sum(line["lost"] for line in run.metrics) == 0, "a rollout without a result"
     assert _counted("rollouts, ", run.output) == sum(line["rollouts"] for line in run.metrics)
-    assert _counted("lost and masked", run.output) == 0
+    assert _counted("lost by the infrastructure", run.output) == 0
     assert _counted("re-dispatched", run.output) >= 1, "the kill hit no rollout: the test shows nothing"
 
 

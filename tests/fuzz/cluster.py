@@ -311,7 +311,7 @@ def _membership(data: bytes) -> object:
     return file.read()
 
 
-def _authority(data: bytes) -> object:
+def _joined_authority(data: bytes) -> object:
     path = in_file("authority/member-x.json", data)
     return authority_of("127.0.0.1:1", path.parent)
 
@@ -453,7 +453,7 @@ def table() -> dict[str, Decoder]:
             mutate_json,
         ),
         "authority of a membership": Decoder(
-            _authority,
+            _joined_authority,
             (),
             lambda: (_kept_membership(),),
             frozenset({"worker.link.membership:authority_of"}),

@@ -172,7 +172,7 @@ def first_hour(
     record: Annotated[
         Path | None,
         typer.Option(
-            help="File that the seeds are added to; the figures are about all in it. "
+            help="File for the seeds, which join those in it; the figures are about all of them. "
             "Default: the seeds are held against the recorded ones."
         ),
     ] = None,

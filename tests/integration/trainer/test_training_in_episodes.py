@@ -206,7 +206,7 @@ def taught(out, number):
 
 
 def test_oracle_finishes_what_the_policy_began_and_that_is_imitated(cluster, tasks, tmp_path, monkeypatch):
-    monkeypatch.setattr(teacher, "_TOGETHER", 2)
+    monkeypatch.setattr(teacher, "_BATCH_EPISODES", 2)
     first = train(cluster, tasks, tmp_path / "one", **TAUGHT)
     second = train(cluster, tasks, tmp_path / "two", processes=2, **TAUGHT)
     untaught = train(cluster, tasks, tmp_path / "alone", grpo__steps=1)

@@ -264,9 +264,8 @@ def _report_errors(command: str, out: Path | None = None) -> Iterator[None]:
     except (TrainerError, ClusterError) as error:
         fail(command, str(error))
     except KeyboardInterrupt:
-        from embomatrix.trainer.run.starting import has_checkpoint
-
-        saved = out is not None and has_checkpoint(out)
+        # No import here: an interrupted import of torch can't be repeated.
+        saved = out is not None and any((out / "checkpoints").glob("[!.]*"))
         sentence = f"interrupted: continue with `--resume --out={out}`" if saved else "interrupted"
         fail(command, sentence, INTERRUPTED)
 

@@ -271,8 +271,3 @@ def digest_of(tasks: TaskSet) -> str:
     """Digest of all tasks and their bundles."""
     lines = (f"{task.task.task_id} {task.bundle_digest}" for task in (*tasks.train, *tasks.heldout))
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
-
-
-def has_checkpoint(out: Path) -> bool:
-    """True if the folder holds a run that can be resumed."""
-    return newest_checkpoint(out) is not None
