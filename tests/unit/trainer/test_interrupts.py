@@ -27,8 +27,9 @@ def test_first_ctrl_c_is_deferred_and_the_second_is_immediate(times, is_whole):
     assert bool(done) is is_whole
 
 
-def test_sigterm_counts_as_ctrl_c_within_the_block():
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
+def test_sigterm_counts_as_ctrl_c_within_the_block(ctrl_c):
+    before, usual = signal.getsignal(signal.SIGTERM), signal.signal(signal.SIGINT, ctrl_c)
     done = []
 
     def ended():
@@ -41,6 +42,7 @@ def test_sigterm_counts_as_ctrl_c_within_the_block():
         ended()
     assert done
     assert signal.getsignal(signal.SIGTERM) is before
+    assert signal.signal(signal.SIGINT, usual) is ctrl_c
 
 
 def test_interrupts_are_deferred_only_inside_the_block():

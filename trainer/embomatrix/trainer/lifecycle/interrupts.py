@@ -12,16 +12,22 @@ from typing import Any, Self
 def sigterm_as_ctrl_c() -> Iterator[None]:
     """Treat SIGTERM as Ctrl-C within the block. Schedulers, containers and `timeout` end a program by it.
 
-    Has no effect outside the main thread, which alone receives signals.
+    A script's background processes begin with Ctrl-C ignored. Within the block they hear it, because an ignored one would
+    swallow SIGTERM too. Has no effect outside the main thread, which alone receives signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    ignores = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignores:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     before = signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+        if ignores:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class DeferredInterrupts:
