@@ -10,7 +10,12 @@ import numpy as np
 
 from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE, Design
 from embomatrix.pages.figures import Better, Figure, Interval
-from embomatrix.trainer.evaluation.intervals import bootstrap, mean_difference, over_seeds_and_tasks
+from embomatrix.trainer.evaluation.intervals import (
+    bootstrap,
+    differences,
+    mean_difference,
+    over_seeds_and_tasks,
+)
 from embomatrix.trainer.logging.outcome import OUTCOME, RunOutcome, TaskRate, read_outcome
 from embomatrix.trainer.logging.recorder import read_metrics
 
@@ -66,10 +71,7 @@ def findings_of(name: str, runs: Sequence[Run]) -> ArmFindings:
     """Summarise an arm's runs. Tasks are the sampling unit: each counts once, with its mean over the seeds."""
     before = [by_task(run.outcome.before) for run in runs]
     after = [by_task(run.outcome.after) for run in runs]
-    gains = [
-        {task: now[task] - then[task] for task in now if task in then}
-        for then, now in zip(before, after, strict=True)
-    ]
+    gains = [differences(then, now) for then, now in zip(before, after, strict=True)]
     return ArmFindings(
         name,
         tuple(runs),
@@ -82,19 +84,20 @@ def findings_of(name: str, runs: Sequence[Run]) -> ArmFindings:
 def difference(first: ArmFindings, other: ArmFindings) -> Interval:
     """Success of another arm after GRPO minus that of the first one, paired by seed and task."""
     known = {run.seed: by_task(run.outcome.after) for run in first.runs}
-    differences = [
-        {task: rate - known[run.seed][task] for task, rate in now.items() if task in known[run.seed]}
-        for run in other.runs
-        if run.seed in known and (now := by_task(run.outcome.after))
-    ]
-    return _interval(differences)
+    return _interval(
+        [
+            differences(known[run.seed], now)
+            for run in other.runs
+            if run.seed in known and (now := by_task(run.outcome.after))
+        ]
+    )
 
 
-def _interval(differences: Sequence[Mapping[str, float]]) -> Interval:
+def _interval(found: Sequence[Mapping[str, float]]) -> Interval:
     """Mean of differences by seed and task, with an interval over both; over tasks alone if there is one seed."""
-    if len(differences) > 1:
-        return over_seeds_and_tasks(differences)
-    return mean_difference(_over_seeds(differences))
+    if len(found) > 1:
+        return over_seeds_and_tasks(found)
+    return mean_difference(_over_seeds(found))
 
 
 def by_task(rates: Sequence[TaskRate]) -> dict[str, float]:

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.pages.figures import Better, Figure, Interval
-from embomatrix.trainer.evaluation.intervals import over_seeds_and_tasks, paired_difference
+from embomatrix.trainer.evaluation.intervals import differences, over_seeds_and_tasks, paired_difference
 from embomatrix.world.whole_file import write_whole
 
 RECORD: Final = Path(__file__).parents[1] / "data" / "first_hour.json"
@@ -54,11 +54,7 @@ class SeedRun:
     @property
     def gains(self) -> Mapping[str, float]:
         """The same difference of each task."""
-        return {
-            task: rate - self.continued.rates[task]
-            for task, rate in self.trained.rates.items()
-            if task in self.continued.rates
-        }
+        return differences(self.continued.rates, self.trained.rates)
 
 
 def add_to_record(path: Path, seeds: Sequence[SeedRun]) -> Sequence[SeedRun]:

@@ -49,7 +49,7 @@ def reward_routes(runs: Runs) -> APIRouter:
     async def rewards(
         request: Request,
         unparsable: _Coefficient = PAPER.unparsable,
-        format: _Coefficient = PAPER.format,  # the coefficient's name
+        format: _Coefficient = PAPER.format,
         relevance_per_object: _Coefficient = PAPER.relevance_per_object,
         relevance_limit: _Coefficient = PAPER.relevance_limit,
         goal: _Coefficient = PAPER.goal,

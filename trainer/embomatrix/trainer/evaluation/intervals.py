@@ -65,16 +65,21 @@ def over_seeds_and_tasks(rows: Sequence[Mapping[str, float]], seed: int = 0) -> 
 
 def paired_difference(before: Mapping[str, float], after: Mapping[str, float]) -> Interval:
     """Mean of after minus before over the tasks in both. NaN rates are left out."""
-    return mean_difference([rate - before[task] for task, rate in after.items() if task in before])
+    return mean_difference(list(differences(before, after).values()))
 
 
-def mean_difference(differences: Sequence[float]) -> Interval:
+def differences(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
+    """Return after minus before of each task in both."""
+    return {task: rate - before[task] for task, rate in after.items() if task in before}
+
+
+def mean_difference(values: Sequence[float]) -> Interval:
     """Mean of the tasks' differences in [-1, 1], with a bootstrap over tasks; NaN is left out.
 
     If all n differences are equal, the bootstrap would be falsely certain. A share of up to 1 - 0.025 ** (1/n) of all tasks may
     then have another difference (Clopper and Pearson 1934, none of n).
     """
-    known = [value for value in differences if value == value]
+    known = [each for each in values if each == each]
     if not known or min(known) < max(known):
         return bootstrap(known)
     share, value = 1 - ((1 - LEVEL) / 2) ** (1 / len(known)), known[0]
