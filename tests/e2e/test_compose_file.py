@@ -137,6 +137,14 @@ def serving(folder):
             yield f"127.0.0.1:{port}", http
 
 
+def test_manager_shows_the_tasks_that_ship_by_name(tmp_path):
+    serve = ("--port=0", "--http-port=0", "--state=memory:", f"--data-dir={tmp_path / 'data'}")
+    with background(tmp_path / "manager.log", "manager", "serve", "--dataset=search", *serve) as manager:
+        manager.wait_for("status page")
+        page = re.search(r"status page (http://\S+),", manager.text)[1]
+        assert httpx.get(f"{page}api/v1/tasks", trust_env=False).json()["total"] > 2000
+
+
 def test_manager_of_an_empty_volume_shows_the_shipped_tasks_once_they_are_written(tmp_path):
     with serving(tmp_path) as (_, http):
         before = http.get("/api/v1/tasks").json()

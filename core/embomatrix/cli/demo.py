@@ -76,8 +76,7 @@ def demo(
     if not ships:
         _ensure_tasks(dataset)
     built_s = time.monotonic()
-    shown = None if ships else dataset
-    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=shown)
+    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=dataset)
     with cluster.supervisor:
         _announce(cluster, slots)
         minutes = None if ships or episodes else _minutes(dataset, model, imitate_steps, steps)

@@ -56,7 +56,8 @@ def serve(
         Path | None,
         typer.Option(
             envvar=DATASET_VARIABLE,
-            help="Folder of the dataset whose tasks the dashboard shows. It is never written. Default: none.",
+            help="Folder of the dataset whose tasks the dashboard shows, or starter for all tasks that ship. It is never "
+            "written. Default: none.",
             show_default=False,
         ),
     ] = None,
@@ -78,28 +79,35 @@ def serve(
     file = read_config(config, _refuse) if config is not None else {}
     settings = _settings(given_options(context), file)
     hide(settings.token)
-    _check_dataset(settings.dataset)
+    if settings.dataset is not None:
+        settings = settings.model_copy(update={"dataset": _shown_dataset(settings.dataset)})
     _serve(settings)
 
 
-def _check_dataset(folder: Path | None) -> None:
-    """Refuse a dataset whose folder is missing, and log why a folder's tasks can't be shown yet.
+def _shown_dataset(named: Path) -> Path:
+    """Return the folder of a dataset, or of all tasks that ship if it has the name of a shipped one.
 
-    The manager starts nevertheless, because the dataset may be written or repaired while it serves.
+    Refuse a folder that is missing, and log why a folder's tasks can't be shown yet. The manager starts nevertheless, because
+    the dataset may be written or repaired while it serves.
     """
-    if folder is None:
-        return
     # Imported here: a manager without a dataset saves the 13 MB of memory that numpy and the code of scenes take.
     from embomatrix.manager.web.gallery import no_tasks_yet
+    from embomatrix.starter.shipped import is_named, unpacked_tasks
     from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
 
+    folder = named
     try:
+        if is_named(named):
+            folder = unpacked_tasks()
         Dataset.load(folder)
+    except OSError as error:
+        _refuse(f"the tasks that ship can't be unpacked: {error}")
     except DatasetError as error:
         if not folder.is_dir():
             _refuse(str(error))
         there = (folder / TASKS_FILE).exists()
         logger.warning("%s", error if there else no_tasks_yet(folder))
+    return folder
 
 
 add_settings(serve, ManagerSettings, skip=ManagerSettings.model_fields.keys() - OPTIONS)
