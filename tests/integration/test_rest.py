@@ -337,6 +337,20 @@ async def test_training_reports_are_shown_after_their_run_closed(tmp_path):
     assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
 
 
+async def test_one_reported_plan_is_shown_by_its_number(tmp_path):
+    plan = SampledPlan("t1", "tidy up", "move 3", RewardTiers(0.5, 0.2, 15.0, False), 1.0)
+    async with manager(tmp_path) as at, open_run(at.address) as client, http_at(at) as http:
+        early = await http.get(f"{PREFIX}/training/r1/plans/1")
+        await client.report_training("r1", TrainingReport("grpo", 4, {"reward": 2.0}, (plan, plan)))
+        second = (await http.get(f"{PREFIX}/training/r1/plans/2")).json()
+        third = await http.get(f"{PREFIX}/training/r1/plans/3")
+    assert (second["step"], second["number"], second["count"]) == (4, 2, 2)
+    assert (second["plan"]["text"], second["task"]) == ("move 3", None)
+    assert "no dataset is shown" in second["notice"]
+    assert early.status_code == third.status_code == 404
+    assert "expected a number from 1 to 2, found 3" in third.json()["detail"]
+
+
 async def test_closed_runs_are_listed_by_name_and_keep_story_plans_and_failures(tmp_path):
     plan = SampledPlan("t1", "tidy up", "move 3", RewardTiers(0.5, 0.2, 15.0, False), 1.0)
     async with (

@@ -12,9 +12,10 @@ from rich.console import Console
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.small_llama import save_small_llama
 
+from embomatrix.envs.rules import EpisodeEnd
 from embomatrix.rpc.episodes import TurnFailedError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
-from embomatrix.skills.parse import DONE
+from embomatrix.skills.parse import DONE, parse_plan
 from embomatrix.trainer.cluster.gateway import Gateway
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.config.settings import TrainSettings, read_settings
@@ -168,10 +169,28 @@ def test_each_answer_has_its_step_advantage(cluster, tasks, tmp_path, monkeypatc
     )
 
 
+def test_dashboard_gets_episodes_turn_by_turn(cluster, tasks, tmp_path, monkeypatch):
+    reports = []
+    monkeypatch.setattr(Gateway, "report", lambda _, report: reports.append(report))
+    train(cluster, tasks, tmp_path / "run", grpo__steps=1)
+    plans = [plan for report in reports for plan in report.plans]
+    assert plans
+    for plan in plans:
+        assert plan.opening.startswith("rooms ")
+        assert plan.end in {*EpisodeEnd}
+        assert "\n".join(turn.answer for turn in plan.turns) == plan.text
+        assert sum(turn.steps for turn in plan.turns) == len(plan.steps)
+        assert all("robot " in turn.observation for turn in plan.turns)
+        assert [parse_plan(step.call)[0].skill.value for step in plan.steps] == [
+            step.skill for step in plan.steps
+        ]
+
+
 def test_a_turn_without_a_result_loses_the_episode_and_not_the_run():
     class Player:
         end = None
         state = "start"
+        steps = ()
 
         async def answer(self, text):
             raise TurnFailedError("three attempts failed", InfraFailure(InfraCode.SLOT_CRASHED, "it crashed"))

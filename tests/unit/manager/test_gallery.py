@@ -186,6 +186,15 @@ def test_plan_moves_picked_objects_to_their_targets():
     assert placed.things[thing] == pytest.approx([x, y], abs=0.01)
 
 
+def test_failed_calls_of_a_plan_change_nothing():
+    row = next(at for at, name in enumerate(TASK.table) if name in movable_objects(SCENE, TASK))
+    plan = parse_plan(f"pick_up {row}\nmove {row}\npick_up {row}")
+    start, refused, at_thing, carried = moments_of(SCENE, TASK, plan, failed={0})
+    assert (refused.held, refused.robot, refused.call) == ([], start.robot, f"pick_up {TASK.table[row]}")
+    assert at_thing.robot != start.robot
+    assert carried.held == [TASK.table[row]]
+
+
 def test_floor_plan_holds_rooms_and_objects():
     plan = floor_plan(SCENE)
     assert [room[0] for room in plan.rooms] == [room.name for room in SCENE.rooms]

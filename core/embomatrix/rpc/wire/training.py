@@ -3,6 +3,7 @@
 A report beyond its size limits is rejected with the name of the field.
 """
 
+import functools
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
@@ -22,15 +23,29 @@ NAME_CHARS: Final = 64
 TEXT_CHARS: Final = 4000
 """Characters of a plan or an instruction; the sender cuts longer ones."""
 MESSAGE_CHARS: Final = 500
+TURN_CHARS: Final = 2000
+"""Characters of an answer or an observation; the sender cuts longer ones."""
+TURNS: Final = MAX_STEPS + 1
+"""Answers of one episode at most: each has a call or counts as one, except the last."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampledStep:
-    """Executed skill call of a plan, with its outcome in words."""
+    """Executed skill call of a plan, with its outcome in words. ``call`` is the call as a line of a plan."""
 
     skill: str
     ok: bool
     message: str
+    call: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SampledTurn:
+    """Answer of a policy in an episode, and the observation that it received. ``steps`` counts the answer's calls."""
+
+    answer: str
+    observation: str
+    steps: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +64,9 @@ class SampledPlan:
 
     ``advantage`` is relative to the group, in standard deviations. ``problem`` says why there was nothing to execute, or why
     there is no result.
+
+    An episode has ``turns``, whose steps are ``steps`` in this order, the text ``opening`` before the first answer, and the
+    reason ``end`` why it ended. A whole plan has none of them.
     """
 
     task_id: str
@@ -58,6 +76,9 @@ class SampledPlan:
     advantage: float
     problem: str = ""
     steps: tuple[SampledStep, ...] = ()
+    turns: tuple[SampledTurn, ...] = ()
+    opening: str = ""
+    end: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +92,14 @@ class TrainingReport:
 
 
 _step_to_proto, _step_from_proto = converters(SampledStep, pb.SampledStep)
+_turn_to_proto, _turn_from_proto = converters(SampledTurn, pb.SampledTurn)
 sampled_plan_to_proto, _plan_from_proto = converters(
     SampledPlan,
     pb.SampledPlan,
     parts={
         "reward": converters(RewardTiers, pb.RewardTiers),
         "steps": (_step_to_proto, _step_from_proto),
+        "turns": (_turn_to_proto, _turn_from_proto),
     },
     absent={"reward": None},
 )
@@ -85,12 +108,15 @@ _PLAN_CHARS: Final = {
     "instruction": TEXT_CHARS,
     "text": TEXT_CHARS,
     "problem": MESSAGE_CHARS,
+    "opening": TEXT_CHARS,
+    "end": NAME_CHARS,
 }
-_STEP_CHARS: Final = {"skill": NAME_CHARS, "message": MESSAGE_CHARS}
+_STEP_CHARS: Final = {"skill": NAME_CHARS, "message": MESSAGE_CHARS, "call": MESSAGE_CHARS}
+_TURN_CHARS: Final = {"answer": TURN_CHARS, "observation": TURN_CHARS}
 
 
 def training_report_to_proto(run_id: str, report: TrainingReport) -> pb.ReportTrainingRequest:
-    """Return the request. Texts and steps of sampled plans beyond their limits are cut off."""
+    """Return the request. Texts, steps and turns of sampled plans beyond their limits are cut off."""
     return pb.ReportTrainingRequest(
         run_id=run_id,
         phase=report.phase,
@@ -114,10 +140,11 @@ def training_report_from_proto(message: pb.ReportTrainingRequest) -> TrainingRep
 
 def _cut_plan(plan: SampledPlan) -> SampledPlan:
     steps = tuple(replace(step, **_cut(step, _STEP_CHARS)) for step in plan.steps[:MAX_STEPS])
-    return replace(plan, steps=steps, **_cut(plan, _PLAN_CHARS))
+    turns = tuple(replace(turn, **_cut(turn, _TURN_CHARS)) for turn in plan.turns[:TURNS])
+    return replace(plan, steps=steps, turns=turns, **_cut(plan, _PLAN_CHARS))
 
 
-def _cut(value: SampledPlan | SampledStep, limits: Mapping[str, int]) -> dict[str, Any]:
+def _cut(value: SampledPlan | SampledStep | SampledTurn, limits: Mapping[str, int]) -> dict[str, Any]:
     """Return the texts within their limits. A model may emit half a surrogate pair, which becomes ``?``."""
     return {
         name: getattr(value, name)[:limit].encode("utf-8", "replace").decode("utf-8")
@@ -126,17 +153,20 @@ def _cut(value: SampledPlan | SampledStep, limits: Mapping[str, int]) -> dict[st
 
 
 def sampled_plan_from_proto(message: pb.SampledPlan) -> SampledPlan:
-    """Return the plan of a report or an archive. Raise ConvertError if a text or the list of steps is too long."""
+    """Return the plan of a report or an archive. Raise ConvertError if a text or a list is too long."""
     _bounded("steps", message.steps, MAX_STEPS)
-    for name, limit in _PLAN_CHARS.items():
-        _bounded(name, getattr(message, name), limit)
-    return replace(_plan_from_proto(message), steps=each("steps", _checked_step, message.steps))
+    _bounded("turns", message.turns, TURNS)
+    _check_texts(_PLAN_CHARS, message)
+    each("steps", functools.partial(_check_texts, _STEP_CHARS), message.steps)
+    each("turns", functools.partial(_check_texts, _TURN_CHARS), message.turns)
+    return _plan_from_proto(message)
 
 
-def _checked_step(message: pb.SampledStep) -> SampledStep:
-    for name, limit in _STEP_CHARS.items():
+def _check_texts(
+    limits: Mapping[str, int], message: pb.SampledPlan | pb.SampledStep | pb.SampledTurn
+) -> None:
+    for name, limit in limits.items():
         _bounded(name, getattr(message, name), limit)
-    return _step_from_proto(message)
 
 
 def _bounded(field: str, value: T, at_most: int) -> T:

@@ -82,7 +82,7 @@ def build_api(
     for routes in (
         read_routes(runtime, snapshots, rules.gate),
         worker_routes(runtime, snapshots),
-        run_routes(runtime, snapshots),
+        run_routes(runtime, snapshots, gallery),
         task_routes(gallery),
         command_routes(runtime, snapshots, revocation),
         reward_routes(runtime.runs),

@@ -4,6 +4,8 @@ The manager has no physics: a moved object appears at the centre of its target. 
 verified poses.
 """
 
+from collections.abc import Container
+from dataclasses import replace
 from typing import Final
 
 from embomatrix.manager.web.gallery_values import Box, FloorPlanView, MomentView
@@ -46,11 +48,16 @@ def movable_objects(scene: Scene, task: Task) -> dict[str, list[float]]:
     return {item.name: _middle(scene, item.name) for item in found if not item.fixed and not item.absent}
 
 
-def moments_of(scene: Scene, task: Task, plan: Plan) -> list[MomentView]:
-    """Return the state after each call of the plan, assuming that every call succeeds."""
+def moments_of(
+    scene: Scene, task: Task, plan: Plan, failed: Container[int] = frozenset()
+) -> list[MomentView]:
+    """Return the state at the start and after each call of the plan. Calls at the places in ``failed`` change nothing."""
     moments = [MomentView("", _rounded(scene.robot.x_m, scene.robot.y_m))]
-    for call in plan:
-        moments.append(_after(scene, task, call, moments[-1]))
+    for place, call in enumerate(plan):
+        if place in failed:
+            moments.append(replace(moments[-1], call=call_in_words(call, task.table)))
+        else:
+            moments.append(_after(scene, task, call, moments[-1]))
     return moments
 
 

@@ -8,6 +8,7 @@ import asyncio
 import functools
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +24,8 @@ from embomatrix.manager.web.gallery_values import (
     TaskPage,
 )
 from embomatrix.rpc.status import NotFoundError, UnavailableError
-from embomatrix.skills.parse import PlanError, plan_from_json
+from embomatrix.rpc.wire.training import SampledStep
+from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord
 from embomatrix.world.evaluate import GoalError
 from embomatrix.world.json_text import parse_json
@@ -97,13 +99,16 @@ class Gallery:
         names = {record.bundle_digest: record.task.scene_id for record in records}
         return [SceneName(digest, name) for digest, name in names.items()][offset : offset + limit]
 
-    async def detail(self, task_id: str) -> TaskDetail:
-        """Return one task. Raises NotFoundError, or UnavailableError for a damaged dataset."""
+    async def detail(self, task_id: str, steps: Sequence[SampledStep] | None = None) -> TaskDetail:
+        """Return one task, with the moments of the steps if they are given, else with those of the oracle's plan.
+
+        Raises NotFoundError, or UnavailableError for a damaged dataset.
+        """
         record = (await self._loaded()).get(task_id)
         if record is None:
             raise NotFoundError(f"the dataset has no task {task_id[:100]!r}: the page of tasks lists them")
         async with self._reading:
-            return await asyncio.to_thread(self._read_detail, record)
+            return await asyncio.to_thread(self._read_detail, record, steps)
 
     async def floor(self, digest: str) -> FloorPlanView:
         """Return the floor plan of a bundle's scene. Raises NotFoundError."""
@@ -166,13 +171,18 @@ class Gallery:
         self._held = (digest, scene)
         return scene
 
-    def _read_detail(self, record: TaskRecord) -> TaskDetail:
+    def _read_detail(self, record: TaskRecord, steps: Sequence[SampledStep] | None) -> TaskDetail:
         task, scene = record.task, self._scene(record.bundle_digest)
         about: frozenset[str] = frozenset()
         problem, moments = "", [*moments_of(scene, task, ())]
         try:
             about = task.goal_objects
-            moments = moments_of(scene, task, plan_from_json(list(record.oracle), task.profile))
+            if steps is None:
+                moments = moments_of(scene, task, plan_from_json(list(record.oracle), task.profile))
+            elif steps:
+                plan = parse_plan("\n".join(step.call for step in steps), task.profile)
+                failed = {place for place, step in enumerate(steps) if not step.ok}
+                moments = moments_of(scene, task, plan, failed)
         except (GoalError, PlanError) as error:
             problem = str(error)
         tree = self._note("trees", task.task_id, "json")

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from embomatrix.rpc.wire.training import SampledPlan
+
 Box = tuple[str, float, float, float, float]
 """Name, then west, south, east and north edges in metres."""
 
@@ -93,8 +95,8 @@ class ObjectRow:
 
 @dataclass(frozen=True, slots=True)
 class TaskDetail:
-    """One task. ``rooms`` are the rooms to show, ``things`` the small objects at the start, ``moments`` the oracle's
-    plan call by call.
+    """One task. ``rooms`` are the rooms to show, ``things`` the small objects at the start, ``moments`` a plan call by call:
+    the oracle's, or that of a policy.
 
     ``tree`` is the layout tree of a generated scene, else None; ``problem`` says why there is no plan to show.
     """
@@ -112,3 +114,19 @@ class TaskDetail:
     things: dict[str, list[float]]
     moments: list[MomentView] = field(default_factory=list)
     problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SampledPlanView:
+    """Plan or episode ``number`` of the ``count`` that a trainer reported with step ``step``.
+
+    ``task`` has its moments: the start, then one for each of its steps. It is None, with the reason in ``notice``, if the
+    manager does not show the task.
+    """
+
+    step: int
+    number: int
+    count: int
+    plan: SampledPlan
+    task: TaskDetail | None = None
+    notice: str = ""

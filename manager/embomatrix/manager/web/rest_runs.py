@@ -1,13 +1,18 @@
 """REST API of runs: open and closed ones, their timelines, and their training."""
 
-from typing import Annotated, Final
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Final
 
 from fastapi import APIRouter, Path, Query, Response
 
 from embomatrix.manager.observe.training_reports import TrainingDetail, TrainingView
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.web.cluster_view import Snapshots
+from embomatrix.manager.web.gallery_values import SampledPlanView
 from embomatrix.manager.web.rest import PREFIX, Limit, Offset, Search, json_response
+from embomatrix.manager.web.rest_tasks import NO_DATASET
 from embomatrix.manager.web.rest_values import (
     PAGE,
     RunDetail,
@@ -18,8 +23,13 @@ from embomatrix.manager.web.rest_values import (
     run_page,
     timeline,
 )
+from embomatrix.rpc.status import NotFoundError, UnavailableError
+
+if TYPE_CHECKING:
+    from embomatrix.manager.web.gallery import Gallery
 
 LONGEST_S: Final = 3600.0
+PlanNumber = Annotated[int, Path(description="Place of the plan among the reported ones, from 1.")]
 RunId = Annotated[
     str, Path(max_length=256, description="Id of the run, as `runs` lists it.", examples=["run-5f2a"])
 ]
@@ -30,8 +40,8 @@ Words = Annotated[str, Query(max_length=64, description="Only runs with this tex
 Seconds = Annotated[float, Query(gt=0, le=LONGEST_S, description="Length of the interval, in seconds.")]
 
 
-def run_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
-    """Return the routes of viewers about runs."""
+def run_routes(runtime: ManagerRuntime, snapshots: Snapshots, gallery: Gallery | None) -> APIRouter:
+    """Return the routes of viewers about runs. ``gallery`` is None if the manager shows no dataset."""
     router = APIRouter(prefix=PREFIX, tags=["runs"])
     history = runtime.history
 
@@ -68,4 +78,33 @@ def run_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
         """Figures of each step by phase, and recent plans of the policy with the result of each call; open or closed."""
         return json_response(await history.training(run_id))
 
+    @router.get(
+        "/training/{run_id}/plans/{number}",
+        response_model=SampledPlanView,
+        summary="One recent plan or episode of a run",
+    )
+    async def plan(run_id: RunId, number: PlanNumber) -> Response:
+        """What the policy wrote and what became of it, call by call on the floor plan; of an episode also each observation."""
+        training = await history.training(run_id)
+        count = len(training.plans)
+        if not 1 <= number <= count:
+            raise NotFoundError(
+                f"the trainer of run {run_id} reported {count} plans with step {training.plans_step}, expected a number from 1 "
+                f"to {count}, found {number}"
+                if count
+                else f"the trainer of run {run_id} has reported no plan yet: look again after its first step"
+            )
+        sampled = training.plans[number - 1]
+        view = SampledPlanView(training.plans_step, number, count, sampled)
+        return json_response(await _with_task(view, gallery))
+
     return router
+
+
+async def _with_task(view: SampledPlanView, gallery: Gallery | None) -> SampledPlanView:
+    if gallery is None:
+        return replace(view, notice=NO_DATASET)
+    try:
+        return replace(view, task=await gallery.detail(view.plan.task_id, view.plan.steps))
+    except (NotFoundError, UnavailableError) as error:
+        return replace(view, notice=str(error))

@@ -432,20 +432,49 @@ class SampledStep(google.protobuf.message.Message):
     SKILL_FIELD_NUMBER: builtins.int
     OK_FIELD_NUMBER: builtins.int
     MESSAGE_FIELD_NUMBER: builtins.int
+    CALL_FIELD_NUMBER: builtins.int
     skill: builtins.str
     ok: builtins.bool
     message: builtins.str
     """Outcome of the call in words."""
+    call: builtins.str
+    """The call as a line of a plan, such as `move 3`."""
     def __init__(
         self,
         *,
         skill: builtins.str = ...,
         ok: builtins.bool = ...,
         message: builtins.str = ...,
+        call: builtins.str = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["message", b"message", "ok", b"ok", "skill", b"skill"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["call", b"call", "message", b"message", "ok", b"ok", "skill", b"skill"]) -> None: ...
 
 Global___SampledStep: typing_extensions.TypeAlias = SampledStep
+
+@typing.final
+class SampledTurn(google.protobuf.message.Message):
+    """One answer of a policy in an episode."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    ANSWER_FIELD_NUMBER: builtins.int
+    OBSERVATION_FIELD_NUMBER: builtins.int
+    STEPS_FIELD_NUMBER: builtins.int
+    answer: builtins.str
+    observation: builtins.str
+    """Text that the policy received for it."""
+    steps: builtins.int
+    """Calls of the answer that were executed or refused."""
+    def __init__(
+        self,
+        *,
+        answer: builtins.str = ...,
+        observation: builtins.str = ...,
+        steps: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["answer", b"answer", "observation", b"observation", "steps", b"steps"]) -> None: ...
+
+Global___SampledTurn: typing_extensions.TypeAlias = SampledTurn
 
 @typing.final
 class SampledPlan(google.protobuf.message.Message):
@@ -458,6 +487,9 @@ class SampledPlan(google.protobuf.message.Message):
     ADVANTAGE_FIELD_NUMBER: builtins.int
     PROBLEM_FIELD_NUMBER: builtins.int
     STEPS_FIELD_NUMBER: builtins.int
+    TURNS_FIELD_NUMBER: builtins.int
+    OPENING_FIELD_NUMBER: builtins.int
+    END_FIELD_NUMBER: builtins.int
     task_id: builtins.str
     instruction: builtins.str
     text: builtins.str
@@ -465,12 +497,20 @@ class SampledPlan(google.protobuf.message.Message):
     advantage: builtins.float
     problem: builtins.str
     """Reason why there was nothing to execute, or no result."""
+    opening: builtins.str
+    """Text before the first answer of an episode, cut to the manager's limit."""
+    end: builtins.str
+    """Reason why the episode ended."""
     @property
     def reward(self) -> Global___RewardTiers:
         """Absent after an infrastructure failure."""
 
     @property
     def steps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SampledStep]: ...
+    @property
+    def turns(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SampledTurn]:
+        """Answers of an episode; none for a whole plan."""
+
     def __init__(
         self,
         *,
@@ -481,9 +521,12 @@ class SampledPlan(google.protobuf.message.Message):
         advantage: builtins.float = ...,
         problem: builtins.str = ...,
         steps: collections.abc.Iterable[Global___SampledStep] | None = ...,
+        turns: collections.abc.Iterable[Global___SampledTurn] | None = ...,
+        opening: builtins.str = ...,
+        end: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["reward", b"reward"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["advantage", b"advantage", "instruction", b"instruction", "problem", b"problem", "reward", b"reward", "steps", b"steps", "task_id", b"task_id", "text", b"text"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["advantage", b"advantage", "end", b"end", "instruction", b"instruction", "opening", b"opening", "problem", b"problem", "reward", b"reward", "steps", b"steps", "task_id", b"task_id", "text", b"text", "turns", b"turns"]) -> None: ...
 
 Global___SampledPlan: typing_extensions.TypeAlias = SampledPlan
 

@@ -58,6 +58,24 @@ MAX_RETRY_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
+class PlayedTurn:
+    """Answer of an episode, and the observation that followed it. ``steps`` counts the answer's calls."""
+
+    answer: str
+    observation: str
+    steps: int
+
+
+@dataclass(frozen=True, slots=True)
+class Transcript:
+    """Texts of an episode: those before the first answer, then turn by turn. ``end`` says why it ended."""
+
+    opening: str
+    turns: tuple[PlayedTurn, ...]
+    end: str
+
+
+@dataclass(frozen=True, slots=True)
 class PlanOutcome:
     """One sampled plan and its result.
 
@@ -65,7 +83,7 @@ class PlanOutcome:
     that can't be parsed: it is scored here and never executed, and ``problem`` gives the reason.
 
     The text of an episode has its answers, and ``outcome`` is only that of a lost one: ``played`` has its steps, failed ones
-    included, and ``cost`` what they cost.
+    included, ``cost`` what they cost, and ``transcript`` all its texts.
     """
 
     text: str
@@ -74,6 +92,7 @@ class PlanOutcome:
     problem: str = ""
     cost: float = 0.0
     played: tuple[Step, ...] = ()
+    transcript: Transcript | None = None
 
     @property
     def value(self) -> float:

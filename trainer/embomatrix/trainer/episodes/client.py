@@ -15,7 +15,7 @@ from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.skills.turns import PrefixMismatchError
-from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome
+from embomatrix.trainer.cluster.gateway import Gateway, PlanOutcome, PlayedTurn, Transcript
 from embomatrix.trainer.episodes.terms import EpisodeTerms
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ class ClusterEpisode:
         self.opening: Prompt | None = None
         self.answers: list[str] = []
         """Answers so far."""
-        self.observations: list[str] = []
-        """Texts that followed the answers."""
+        self.turns: list[PlayedTurn] = []
+        """Answers that got an observation."""
         self.states: list[Hashable] = []
         """State before each answer."""
         self.policy_answers = 0
@@ -87,8 +87,10 @@ class ClusterEpisode:
         self.answers.append(text)
         self.states.append(self.player.state)
         observation = await self._try(lambda: self.player.answer(text))
-        self.observations.append("" if observation is None else observation.text)
-        return self.observations[-1]
+        if observation is None:
+            return ""
+        self.turns.append(PlayedTurn(text, observation.text, len(observation.steps)))
+        return observation.text
 
     async def advise(self) -> Advice | None:
         """Ask the oracle what it would do from here on; None if the infrastructure lost the episode. Raises ClusterError."""
@@ -107,11 +109,16 @@ class ClusterEpisode:
     def outcome(self) -> PlanOutcome:
         """Return the outcome of the episode, with its answers as text, one a line."""
         text = "\n".join(self.answers)
+        steps = tuple(self.player.steps)
+        transcript = Transcript(
+            "" if self.opening is None else self.opening.user, tuple(self.turns), self.player.end or ""
+        )
         if self.lost is not None:
-            return PlanOutcome(text, None, self.lost)
-        reward, steps = self.player.reward, tuple(self.player.steps)
-        problem = "" if steps else "the episode has no call"
-        return PlanOutcome(text, reward.tiers, problem=problem, cost=reward.cost, played=steps)
+            return PlanOutcome(text, None, self.lost, transcript=transcript)
+        reward, problem = self.player.reward, "" if steps else "the episode has no call"
+        return PlanOutcome(
+            text, reward.tiers, problem=problem, cost=reward.cost, played=steps, transcript=transcript
+        )
 
 
 class EpisodeClient:

@@ -214,7 +214,7 @@ def successful(episode: ClusterEpisode, policy_answers: int = 0) -> OracleEpisod
     if not episode.outcome().success or episode.opening is None or len(episode.answers) == policy_answers:
         return None
     return OracleEpisode(
-        episode.opening, tuple(zip(episode.answers, episode.observations, strict=True)), policy_answers
+        episode.opening, tuple((turn.answer, turn.observation) for turn in episode.turns), policy_answers
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.wire.training import (
@@ -12,8 +13,10 @@ from embomatrix.rpc.wire.training import (
     RewardTiers,
     SampledPlan,
     SampledStep,
+    SampledTurn,
     TrainingReport,
 )
+from embomatrix.skills.parse import plan_to_lines
 from embomatrix.trainer.grpo.records import GroupLog
 from embomatrix.trainer.logging.trackers import GRPO_PHASE
 
@@ -66,7 +69,20 @@ def _plan(log: GroupLog, outcome: PlanOutcome, advantage: float) -> SampledPlan:
     tiers = None
     if reward is not None:
         tiers = RewardTiers(reward.format, reward.relevance, reward.goal, reward.success)
-    steps = tuple(SampledStep(step.call.skill.value, step.ok, step.message) for step in outcome.steps)
-    problem = outcome.problem or outcome.lost
-    finite = advantage if math.isfinite(advantage) else 0.0
-    return SampledPlan(task.task_id, task.instruction, outcome.text, tiers, finite, problem, steps)
+    steps = tuple(
+        SampledStep(step.call.skill.value, step.ok, step.message, plan_to_lines((step.call,)))
+        for step in outcome.steps
+    )
+    sampled = SampledPlan(
+        task_id=task.task_id,
+        instruction=task.instruction,
+        text=outcome.text,
+        reward=tiers,
+        advantage=advantage if math.isfinite(advantage) else 0.0,
+        problem=outcome.problem or outcome.lost,
+        steps=steps,
+    )
+    if outcome.transcript is None:
+        return sampled
+    turns = tuple(SampledTurn(turn.answer, turn.observation, turn.steps) for turn in outcome.transcript.turns)
+    return replace(sampled, turns=turns, opening=outcome.transcript.opening, end=outcome.transcript.end)

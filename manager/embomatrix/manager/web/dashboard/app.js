@@ -9,7 +9,7 @@ const PAGES = {
   failures: () => import("./failures.js"), training: () => import("./training.js"), tasks: () => import("./tasks.js"),
   runs: () => import("./runs.js"), rest: () => import("./rest.js"),
 };
-const PARTS = [() => import("./worker.js"), () => import("./run.js"), () => import("./compare.js")];
+const PARTS = [() => import("./worker.js"), () => import("./run.js"), () => import("./compare.js"), () => import("./sampled.js")];
 const REFRESH_MS = 1000;
 /** Rows of workers in the snapshot, by page; other pages need none. */
 const ROWS = {workers: 50};

@@ -56,10 +56,16 @@ function latestFailures(events) {
 
 const points = number => signed(number.toFixed(2));
 
-/** Plan that a policy wrote, with its reward and the result of each call. */
-export function sampledPlan({text, reward, advantage, problem, steps, task_id}) {
-  const verdict = reward ? [h("b", {class: reward.success ? "reached" : ""}, reward.success ? "reached the goal" : "did not reach the goal"),
-    ` · reward ${points(reward.format + reward.relevance + reward.goal)} (format ${points(reward.format)}, relevance ${points(reward.relevance)}, goal ${points(reward.goal)}) · advantage ${points(advantage)}`] : h("b", {class: "bad"}, "infrastructure failure, no reward");
-  return h("div", {class: "plan"}, h("p", {}, verdict, h("span", {class: "muted"}, ` · ${task_id}`)), problem && h("p", {class: "bad message"}, problem), h("pre", {tabindex: "0"}, text || "(nothing)"),
-    steps.length > 0 && h("ol", {class: "steps"}, steps.map(step => h("li", {}, h("code", {class: step.ok ? "reached" : "bad"}, step.skill), ` ${step.message || (step.ok ? "done" : "failed")}`))));
+/** Result of a plan or an episode: goal reached or not, reward by tier, and advantage. */
+export function verdict({reward, advantage}) {
+  if (!reward) return h("b", {class: "bad"}, "infrastructure failure, no reward");
+  return h("span", {}, h("b", {class: reward.success ? "reached" : ""}, reward.success ? "reached the goal" : "did not reach the goal"),
+    ` · reward ${points(reward.format + reward.relevance + reward.goal)} (format ${points(reward.format)}, relevance ${points(reward.relevance)}, goal ${points(reward.goal)}) · advantage ${points(advantage)}`);
+}
+
+/** Plans or episodes of a run that a policy wrote, each with its verdict and the result of each call. */
+export function sampledPlans(run_id, plans) {
+  return plans.map((plan, i) => h("div", {class: "plan"}, h("p", {}, verdict(plan), h("span", {class: "muted"}, ` · ${plan.task_id} `), h("a", {class: "watch", href: `#training?${encodeURIComponent(run_id)}&${i + 1}`}, plan.turns.length ? "Watch turn by turn" : "Watch call by call")),
+    plan.problem && h("p", {class: "bad message"}, plan.problem), h("pre", {tabindex: "0"}, plan.text || "(nothing)"),
+    plan.steps.length > 0 && h("ol", {class: "steps"}, plan.steps.map(step => h("li", {}, h("code", {class: step.ok ? "reached" : "bad"}, step.call || step.skill), ` ${step.message || (step.ok ? "done" : "failed")}`)))));
 }

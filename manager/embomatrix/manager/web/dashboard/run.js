@@ -2,7 +2,7 @@
 import {Refused, ask} from "./ask.js";
 import {chart} from "./charts.js";
 import {at, count, counted, h, none, put, seconds, share, table} from "./dom.js";
-import {failureParts, phaseTable, sampledPlan, totalText} from "./parts.js";
+import {failureParts, phaseTable, sampledPlans, totalText} from "./parts.js";
 import {saveJson, savePage} from "./save.js";
 
 const CURVES = [["reward", "Reward per step"], ["success", "Success per step"]];
@@ -78,5 +78,5 @@ function learned() {
   }
   const plans = trained?.plans ?? [];
   at("which").textContent = plans.length ? `of step ${count(trained.plans_step)}, ${counted(plans.length, "plan")}: ${plans[0].instruction}` : "";
-  put(at("sampled"), plans.length ? plans.map(sampledPlan) : none("Its trainer sent no plans to this manager."));
+  put(at("sampled"), plans.length ? sampledPlans(run_id, plans) : none("Its trainer sent no plans to this manager."));
 }

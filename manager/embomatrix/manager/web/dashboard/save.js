@@ -2,7 +2,7 @@
 import {h} from "./dom.js";
 
 const STYLES = ["/static/style.css", "/static/vendor/uPlot.min.css"];
-const CONTROLS = "button, select, input, label, .bar, .back";
+const CONTROLS = "button, select, input, label, .bar, .back, .watch";
 
 function save(name, text, type) {
   const link = h("a", {href: URL.createObjectURL(new Blob([text], {type})), download: name});

@@ -1,31 +1,23 @@
 // One task: instruction, objects, transcript, and the oracle's plan on the floor plan.
 import {ask, picture} from "./ask.js";
 import {at, categoryWords, h, put, splitWords, table} from "./dom.js";
+import {close as stop, follower} from "./follow.js";
 import {drawn} from "./plan.js";
 
-const STEP_MS = 1200;
-let playing = 0, number = 0, moments = [], view = null;
-
-export function close() {
-  clearInterval(playing);
-  playing = 0;
-}
+export const close = stop;
 
 /** Show the task in a place; throws Refused. */
 export async function open(place, task_id) {
   const detail = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = detail, about = new Set(detail.objects.filter(row => row.goal).map(row => row.name));
-  ({moments} = detail);
-  view = drawn(detail.floor, {rooms: detail.rooms, about, things: detail.things, label: `floor plan of ${card.scene_id}`});
+  const {moments} = detail, view = drawn(detail.floor, {rooms: detail.rooms, about, things: detail.things, label: `floor plan of ${card.scene_id}`});
   const facts = [["scene", card.scene_id], ["category", categoryWords(card.category)], ["split", splitWords(card.split)], ["source", detail.source], ["profile", detail.profile], ["goal type", detail.signature]];
-  const steps = moments.map((moment, i) => h("li", {}, h("button", {type: "button", class: "step", onclick: () => { close(); go(i); }}, moment.call || "start")));
-  const button = (id, words, act) => h("button", {type: "button", id, onclick: act}, words);
+  const {list, controls, go} = follower(view, moments, moments.map((moment, i) => ({words: moment.call || "start", moment: i, below: ""})));
   place.replaceChildren(
     h("section", {}, h("h2", {}, h("a", {href: "#tasks"}, "All tasks"), h("small", {}, card.task_id)), h("p", {class: "instruction"}, card.instruction),
       h("dl", {class: "facts"}, facts.filter(([, value]) => value).map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))))),
     h("section", {class: "most"}, h("h2", {}, "The oracle's plan ", h("small", {}, "moved objects are drawn at their targets, not at their verified poses")), view.picture, view.key,
-      h("div", {class: "bar"}, button("first", "Start", () => { close(); go(0); }), button("back", "Back", () => { close(); go(number - 1); }), button("play", "Play", play), button("next", "Next", () => { close(); go(number + 1); }),
-        h("span", {id: "said", role: "status"}))),
-    h("section", {class: "third"}, h("h2", {}, "Steps ", h("small", {}, detail.problem)), h("ol", {class: "calls", start: "0", onkeydown: key}, steps)),
+      controls),
+    h("section", {class: "third"}, h("h2", {}, "Steps ", h("small", {}, detail.problem)), list),
     card.picture ? h("section", {class: "half"}, h("h2", {}, "Picture"), h("div", {id: "picture"})) : "",
     h("section", {class: card.picture ? "half" : ""}, h("h2", {}, "Goal"), h("pre", {class: "goaltext", tabindex: "0"}, detail.goal)),
     h("section", {}, h("h2", {}, "Objects ", h("small", {}, "object table of the plans; goal objects in bold")), objects(detail.objects)),
@@ -33,33 +25,6 @@ export async function open(place, task_id) {
     detail.tree ? h("section", {class: detail.transcript ? "half" : ""}, h("h2", {}, "Layout tree"), tree(detail.tree)) : "");
   go(0);
   if (card.picture) put(at("picture"), h("img", {alt: `rendered picture of ${card.scene_id}`, src: await picture(`scenes/${card.bundle_digest}/picture`)}));
-}
-
-function go(to) {
-  number = Math.max(0, Math.min(moments.length - 1, to));
-  const moment = moments[number];
-  view.show(moments, number);
-  document.querySelectorAll(".calls button").forEach((button, i) => { if (i === number) button.setAttribute("aria-current", "step"); else button.removeAttribute("aria-current"); });
-  at("said").textContent = `${number} of ${moments.length - 1}${moment.held.length ? `, holds ${moment.held.join(", ")}` : ""}${moment.active.length ? `, open or on: ${moment.active.join(", ")}` : ""}`;
-  at("back").disabled = at("first").disabled = number === 0;
-  at("next").disabled = number === moments.length - 1;
-  at("play").textContent = playing ? "Pause" : "Play";
-}
-
-function play() {
-  if (playing) { close(); go(number); return; }
-  if (number === moments.length - 1) number = 0;
-  playing = setInterval(() => { if (number >= moments.length - 2) close(); go(number + 1); }, STEP_MS);
-  go(number);
-}
-
-function key(event) {
-  const moves = {ArrowDown: 1, ArrowUp: -1};
-  if (!(event.key in moves)) return;
-  event.preventDefault();
-  close();
-  go(number + moves[event.key]);
-  document.querySelectorAll(".calls button")[number].focus();
 }
 
 function objects(rows) {

@@ -1,8 +1,8 @@
 // Training: reward by tier, success, zero-variance groups, time, and sampled plans with their results.
 import {Refused, ask} from "./ask.js";
 import {chart} from "./charts.js";
-import {at, categoryWords, clock, count, decoded, h, none, put, seconds, share, table} from "./dom.js";
-import {sampledPlan} from "./parts.js";
+import {asked, at, categoryWords, clock, count, decoded, h, none, put, seconds, share, table} from "./dom.js";
+import {sampledPlans} from "./parts.js";
 
 const CHARTS = [
   ["tiers", "Reward by tier", "mean per step", {reward: "all", reward_goal: "goal", reward_relevance: "relevance", reward_format: "format"}],
@@ -17,10 +17,18 @@ const LATEST = 10;
 /** Run of the page's address, whose reports the manager may have on disk only. */
 let wanted = "";
 let run = "", seen = "", drawn = {}, report = null;
+/** Page of one plan, if the address names one. */
+let inner = null;
 
-export function open(main) {
-  run = wanted = decoded(location.hash.split("?")[1] ?? "");
-  seen = ""; drawn = {}; report = null;
+export async function open(main) {
+  const [named, plan] = asked().split("&").map(decoded);
+  run = wanted = named;
+  seen = ""; drawn = {}; report = null; inner = null;
+  if (plan) {
+    inner = await import("./sampled.js");
+    inner.open(main, named, plan);
+    return;
+  }
   main.replaceChildren(
     h("section", {}, h("h2", {}, "Training ", h("small", {id: "when"})),
       h("div", {class: "bar"}, h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; dispatchEvent(new Event("embomatrix-changed")); }}))),
@@ -33,15 +41,17 @@ export function open(main) {
 }
 
 export function close() {
+  inner?.close();
   for (const one of Object.values(drawn)) one.close();
   drawn = {};
 }
 
 export async function show({training}) {
+  if (inner) { await inner.show(); return; }
   if (!training.some(one => one.run_id === run) && (!run || run !== wanted)) run = training[0]?.run_id ?? "";
   if (!run && report) {  // another manager leads, and no trainer has reported to it yet
     close();
-    open(at("main"));
+    await open(at("main"));
   }
   const archived = wanted && !training.some(one => one.run_id === wanted) ? [report?.run.run_id === wanted ? report.run : {run_id: wanted, name: "", revision: 1}] : [];
   const every = [...archived, ...training];
@@ -78,7 +88,7 @@ function draw({run: view, phases, plans, plans_step}) {
   spent(grpo.figures);
   heldout(named);
   at("which").textContent = plans.length ? `with the largest reward differences in step ${count(plans_step)}: ${plans[0].instruction}` : "";
-  put(at("sampled"), plans.length ? plans.map(sampledPlan) : none("No plans yet."));
+  put(at("sampled"), plans.length ? sampledPlans(view.run_id, plans) : none("No plans yet."));
 }
 
 function tiles({steps, figures}) {
