@@ -138,6 +138,23 @@ def test_training_has_no_need_and_no_goal_shape_of_the_held_out_split(bases: dic
     assert all(need_weights("heldout", 0, missing)[name] > 1 for name in held_out)
 
 
+def test_days_of_training_have_no_need_of_the_held_out_split(bases: dict[str, Scene]) -> None:
+    weights = need_weights("train", 0, dict.fromkeys(TaskCategory, 10))
+    rare = dict.fromkeys(weights, 0.0) | {"a yoga class 1": 1.0}
+    drawn: set[str] = set()
+    for base in bases.values():
+        view, cast = SceneView(base), people(base)[0]
+        for seed in range(8):
+            rng = np.random.default_rng(seed)
+            drawn |= {asked.need.name for asked in draw_needs(view, cast, 12, 12, rng, weights)}
+            assert {asked.need.name for asked in draw_needs(view, cast, 12, 12, rng, rare)} <= {
+                "a yoga class 1"
+            }
+            assert draw_needs(view, cast, 12, 12, rng, dict.fromkeys(weights, 0.0)) == []
+    assert len(drawn) > 20
+    assert not {name for name in drawn if is_held_out(name, 0, 5)}
+
+
 def test_a_day_depends_only_on_settings_and_order() -> None:
     settings = BuildSettings(reachability=False, physical=False, writer=WriterKind.SOCIAL)
     rooms = tuple(room.name for room in build_base_scene("Pomaria_1_int").rooms)

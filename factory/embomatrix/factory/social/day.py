@@ -99,16 +99,18 @@ def draw_needs(
     rng: np.random.Generator,
     weights: Mapping[str, float],
 ) -> list[NeedOfDay]:
-    """Return up to ``most`` needs of one day, at most ``each_event`` of an event. ``weights`` make needs likelier by name."""
-    candidates = events_for(view.scene.base, cast)
+    """Return up to ``most`` needs of one day, at most ``each_event`` of an event.
+
+    ``weights`` make needs likelier by name; one of weight 0 is never drawn.
+    """
+
+    def best(event: Event) -> float:
+        return max(weights.get(need.name, 1.0) for need in event.needs)
+
+    candidates = [item for item in events_for(view.scene.base, cast) if best(item[0]) > 0]
     agenda = Agenda()
     while candidates and len(agenda.needs) < most:
-        likely = np.array(
-            [
-                weight * max(weights.get(need.name, 1.0) for need in event.needs)
-                for event, _, weight in candidates
-            ]
-        )
+        likely = np.array([weight * best(event) for event, _, weight in candidates])
         event, person, _ = candidates[int(rng.choice(len(candidates), p=likely / likely.sum()))]
         candidates = [item for item in candidates if item[0] is not event]
         low, high = event.hours
@@ -126,9 +128,11 @@ def draw_needs(
 
 
 def _drawn_order(needs: Sequence[Need], weights: Mapping[str, float], rng: np.random.Generator) -> list[Need]:
-    """Return the needs in random order, those with larger weights earlier."""
-    keys = [rng.random() ** (1 / max(weights.get(need.name, 1.0), 1e-3)) for need in needs]
-    return [need for _, need in sorted(zip(keys, needs, strict=True), key=lambda pair: -pair[0])]
+    """Return the needs in random order, those with larger weights earlier, without those of weight 0."""
+    possible = [(need, weight) for need in needs if (weight := weights.get(need.name, 1.0)) > 0]
+    keys = [rng.random() ** (1 / weight) for _, weight in possible]
+    ordered = sorted(zip(keys, possible, strict=True), key=lambda pair: -pair[0])
+    return [need for _, (need, _) in ordered]
 
 
 def wish_of(need: Need, view: SceneView, rng: np.random.Generator) -> tuple[Wish, int] | None:
