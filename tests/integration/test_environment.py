@@ -1,6 +1,7 @@
 """The front door to episodes: the same answers have the same observations in this process and on a cluster."""
 
 import asyncio
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from embomatrix.envs import EpisodeEnd, EpisodeRules, Visibility, make
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.skills.episode_text import FORMAT
 from embomatrix.world.bundle import Bundle, encode_bundle
-from embomatrix.world.dataset import DatasetError, TaskRecord, write_dataset
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord, write_dataset
 from embomatrix.world.inflation import bundle_digest
 
 pytestmark = pytest.mark.timeout(180)
@@ -119,6 +120,34 @@ def test_misuse_is_named(dataset):
         make(dataset, split="train")
     with pytest.raises(ValueError, match="visibility is 'some': expected one of full, seen"):
         make(dataset, visibility="some")
+
+
+def test_tasks_of_another_split_are_not_played(dataset, tmp_path):
+    records = [
+        dataclasses.replace(record, split="train" if number == 0 else "heldout")
+        for number, record in enumerate(Dataset.load(dataset).records)
+    ]
+    write_dataset(
+        tmp_path,
+        records,
+        {records[0].bundle_digest: Dataset.load(dataset).bundle_bytes(records[0].bundle_digest)},
+    )
+    with make(tmp_path, split="train") as environment:
+        held_out = records[1].task.task_id
+        with pytest.raises(
+            DatasetError, match=f"{held_out} is of the split heldout, and this environment plays train"
+        ):
+            environment.reset(held_out)
+
+
+def test_observations_of_others_are_kept_if_a_turn_fails(dataset):
+    with make(dataset) as environment:
+        first, second = environment.begin([(environment.task_ids[0], seed) for seed in (0, 1)])
+        first.player.stop()
+        with pytest.raises(RuntimeError, match="the episode is over"):
+            environment.answer((first, second), ["move 1", "move 1"])
+        assert second.player.observation.text.startswith("move 1: stands at ")
+        assert first.player.observation is None
 
 
 def test_format_of_the_texts_is_the_documented_one():

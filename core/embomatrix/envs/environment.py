@@ -59,6 +59,7 @@ class Environment:
                 f"the dataset at {dataset.folder} has no task of the split {split!r}: expected one of {', '.join(SPLITS)} "
                 "with tasks"
             )
+        self._split = split
         self.rules = rules
         self.dataset = dataset
         """Tasks of all splits, and their scenes."""
@@ -118,14 +119,15 @@ class Environment:
         return self._current
 
     def begin(self, tasks: Sequence[tuple[str, int]]) -> tuple[PlayedEpisode, ...]:
-        """Begin an episode of each task, with its seed."""
-        records = [(self.dataset.find(task_id), seed) for task_id, seed in tasks]
+        """Begin an episode of each task, with its seed. Raises DatasetError for a task that the split lacks."""
+        records = [(self._find(task_id), seed) for task_id, seed in tasks]
         return self._wait(_all([self._begin(record, seed) for record, seed in records]))
 
     def answer(self, episodes: Sequence[PlayedEpisode], texts: Sequence[str]) -> tuple[Observation, ...]:
         """Take one answer for each of the episodes, and execute them together.
 
-        Raises ValueError for another number of answers, and for one that is no text.
+        Raises ValueError for another number of answers, and for one that is no text; and what executing a turn raises, after
+        all turns have ended. The others are executed then: ``player.observation`` of their episodes has what came of them.
         """
         if len(episodes) != len(texts):
             raise ValueError(
@@ -137,6 +139,15 @@ class Environment:
         return self._wait(
             _all([each.player.answer(text) for each, text in zip(episodes, texts, strict=True)])
         )
+
+    def _find(self, task_id: str) -> TaskRecord:
+        record = self.dataset.find(task_id)
+        if record.split != self._split:
+            raise DatasetError(
+                f"the task {task_id} is of the split {record.split}, and this environment plays {self._split}: name one of its "
+                f"task_ids, or make another environment with split={record.split!r}"
+            )
+        return record
 
     def announce(self, steps: Sequence[Sequence[str]], count: int) -> None:
         """Say which tasks, by id, the coming steps play, with ``count`` episodes of each: a cluster loads their scenes by then.

@@ -93,11 +93,14 @@ def play_episode(environment: Environment) -> Solver:
         ]
         state.tools = as_inspect_tools(tools)
         player = tools.episode.player
-        while player.end is None and not state.completed:
-            state = await generate(state, tool_calls="single")
-            if not state.output.choices or not state.output.message.tool_calls:
-                break
-        state.store.set(_REWARD, _numbers(player.reward))
+        try:
+            while player.end is None and not state.completed:
+                state = await generate(state, tool_calls="single")
+                if not state.output.choices or not state.output.message.tool_calls:
+                    break
+        finally:
+            # Inspect also scores samples that a limit of messages, tokens or time ends here.
+            state.store.set(_REWARD, _numbers(player.reward))
         return state
 
     return solve

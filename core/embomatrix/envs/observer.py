@@ -73,18 +73,29 @@ class Observer:
             self._follow(start, 0)
         return opening(self.situation, self._codec, seen=self._seen, at_once=at_once)
 
+    @property
+    def naming(self) -> Situation:
+        """Situation of the whole table, with the names that the policy is told."""
+        return self._whole
+
     def refusal(self, call: SkillCall) -> Step | None:
         """Return the failed step of a call with a row that the policy does not know; None for other calls.
 
         Such a call must not be executed: its outcome would tell whether the row exists.
         """
-        if not self._seen:
+        index = next((index for index in _rows_of(call) if index not in self.memory), None)
+        if not self._seen or index is None:
             return None
-        for index in (call.object_index, call.source_index):
-            if index is not None and index not in self.memory:
-                sentence = f"there is no object with index {index} among those that you have seen"
-                return Step(call, FailureReason.UNKNOWN_INDEX, sentence)
-        return None
+        sentence = f"there is no object with index {index} among those that you have seen"
+        return Step(call, FailureReason.UNKNOWN_INDEX, sentence)
+
+    def comes_to_know(self, call: SkillCall, turn: TurnObservation) -> bool:
+        """Return whether the policy knows all rows of a call once it is told of the turn."""
+        return {*_rows_of(call)} <= self.memory.keys() | {*self._true_rows(turn)}
+
+    def outcomes(self, steps: Sequence[Step]) -> tuple[str, ...]:
+        """Return the message of each step in the policy's words."""
+        return tuple(map(self._wording.outcome, steps))
 
     def tell(
         self, steps: Sequence[Step], turn: TurnObservation | None, calls: int, notes: Sequence[str] = ()
@@ -128,6 +139,10 @@ class Observer:
 
     def _row(self, index: int) -> PromptRow:
         return self._true[self._by_index[index]]
+
+
+def _rows_of(call: SkillCall) -> tuple[int, ...]:
+    return tuple(index for index in (call.object_index, call.source_index) if index is not None)
 
 
 def _described(text: str) -> ObjectDescription | None:

@@ -110,7 +110,7 @@ class HouseholdEnvironment(Environment[AnswerAction, HouseholdObservation, House
         )
         return HouseholdObservation(
             text=observation.text,
-            messages=[step.message for step in observation.steps],
+            messages=[*observation.messages],
             end=observation.end or "",
             reward=gain,
             done=observation.end is not None,

@@ -29,10 +29,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Text that a policy is told after an answer, with its facts. ``steps`` are the outcomes of the answer's calls."""
+    """Text that a policy is told after an answer, with its facts.
+
+    ``steps`` are the outcomes of the answer's calls, with the names of the simulator; ``messages`` those in the policy's words.
+    """
 
     text: str
     steps: tuple[Step, ...]
+    messages: tuple[str, ...]
     reward: EpisodeReward
     end: EpisodeEnd | None
     """Reason why the episode is over; None while it goes on."""
@@ -64,6 +68,8 @@ class EpisodePlayer:
         """Outcomes of all calls so far, refused ones included."""
         self.end: EpisodeEnd | None = None
         self.reward = EpisodeReward(unparsable(reward))
+        self.observation: Observation | None = None
+        """Observation after the latest answer."""
         self._repeated: SkillCall | str = ""
         self._repeats = 0
         self._way: tuple[SkillCall, ...] = ()
@@ -93,10 +99,10 @@ class EpisodePlayer:
         if self.end is not None:
             raise RuntimeError(f"the episode is over ({self.end}): begin another")
         most = min(self._rules.calls_per_answer, self._rules.calls - self.reward.calls)
-        if len(calls) > most:
-            notes = (*notes, left_out(len(calls), most))
+        steps, turn, were_unknown = await self._execute(calls[:most])
+        if len(calls) > most or were_unknown:
+            notes = (*notes, left_out(len(calls), len(steps)))
             done = False
-        steps, turn = await self._execute(calls[:most])
         self.steps += steps
         for call in (step.call for step in steps if step.ok):
             if call.skill in (Skill.MOVE, Skill.GO_TO_ROOM):
@@ -107,7 +113,9 @@ class EpisodePlayer:
         observed = turn.observation if turn is not None else None
         told = self.observer.tell(steps, observed, self.reward.calls, notes)
         self.end = self._ending(done=done and all(step.ok for step in steps))
-        return Observation(told, tuple(steps), self.reward, self.end)
+        messages = self.observer.outcomes(steps)
+        self.observation = Observation(told, tuple(steps), messages, self.reward, self.end)
+        return self.observation
 
     @property
     def state(self) -> Hashable:
@@ -132,14 +140,18 @@ class EpisodePlayer:
 
     def _read(self, text: str) -> tuple[Plan, bool, list[str]]:
         """Return the calls of an answer, whether it ends the episode, and notes about it."""
-        words = with_indices(text, self._situation) if self.codec is Codec.NAMES else text
+        words = with_indices(text, self.observer.naming) if self.codec is Codec.NAMES else text
         try:
             return *parse_answer(words, self._situation.profile), []
         except PlanError as error:
             return (), False, [not_an_action(error, self.codec)]
 
-    async def _execute(self, calls: Sequence[SkillCall]) -> tuple[list[Step], Turn | None]:
-        """Execute calls up to the first that fails, and refuse those with unknown rows without execution."""
+    async def _execute(self, calls: Sequence[SkillCall]) -> tuple[list[Step], Turn | None, bool]:
+        """Execute calls up to the first that fails, and refuse those with unknown rows without execution.
+
+        Return true at last if calls were left out because the calls before them brought their rows into sight: the policy
+        could not know these rows when it answered.
+        """
         allowed: list[SkillCall] = []
         refused: Step | None = None
         for call in calls:
@@ -149,9 +161,11 @@ class EpisodePlayer:
             allowed.append(call)
         turn = await self._running.act(allowed) if allowed else None
         steps = [*turn.steps] if turn is not None else []
-        if refused is not None and len(steps) == len(allowed) and (not steps or steps[-1].ok):
-            steps.append(refused)
-        return steps, turn
+        if refused is None or len(steps) < len(allowed) or (steps and not steps[-1].ok):
+            return steps, turn, False
+        if turn is not None and self.observer.comes_to_know(refused.call, turn.observation):
+            return steps, turn, True
+        return [*steps, refused], turn, False
 
     def _count(self, steps: Sequence[Step], turn: Turn | None, *, unread: str | None) -> None:
         """Count the calls of an answer, or an answer that could not be read, and how often the same one failed in a row."""

@@ -104,7 +104,7 @@ class Endpoint:
                 elapsed_s = time.monotonic() - began_s
                 last = attempt + 1 == self._limits.attempts or elapsed_s + wait_s > self._limits.deadline_s
                 if not found.transient or last:
-                    raise EndpointError(self._sentence(request, found, attempt + 1))
+                    raise EndpointError(self._sentence(request, found, attempt + 1), found.status)
                 await asyncio.sleep(wait_s)
         raise AssertionError("the last attempt returns or raises")
 

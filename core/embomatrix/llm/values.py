@@ -67,7 +67,14 @@ class LlmError(Exception):
 
 
 class EndpointError(LlmError):
-    """Raised when the endpoint is unreachable, refuses, or answers with something other than a chat completion."""
+    """Raised when the endpoint is unreachable, refuses, or answers with something other than a chat completion.
+
+    ``status`` is the HTTP status of a refusal that is not worth another try, else 0.
+    """
+
+    def __init__(self, sentence: str, status: int = 0) -> None:
+        super().__init__(sentence)
+        self.status = status
 
 
 class UnusableReplyError(LlmError):

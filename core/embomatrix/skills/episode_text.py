@@ -1,4 +1,4 @@
-"""Texts of episodes, format 2: the prompt at the start, and the observation after each answer.
+"""Texts of episodes, format 3: the prompt at the start, and the observation after each answer.
 
 Three codecs, as for prompts: ``names`` for word-level policies, ``lines`` and ``json`` for language models. Objects have the
 names that the prompt gives them; an object that the policy does not know is ``something``.
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.trace import Step
     from embomatrix.world.task import Profile
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 """Version of the texts. It changes when any of them does."""
 UNKNOWN: Final = "something"
 """Name of an object that the policy does not know."""
@@ -154,9 +154,14 @@ class Wording:
             return name.rpartition("_")[0].replace("_", " ")
         return self._label(row) if self._known(row.index) else UNKNOWN
 
-    def sentence(self, text: str) -> str:
-        """Return a sentence with the policy's words for objects. Names of rooms stay."""
-        return _NAME.sub(lambda found: found[0] if found[0] in self._home else self.name(found[0]), text)
+    def outcome(self, step: Step) -> str:
+        """Return a step's message with the policy's words for objects. Names of rooms stay."""
+        if step.failure is FailureReason.UNKNOWN_ROOM:
+            # It repeats the policy's own word, which may be the name of an object that it has not seen.
+            return step.message
+        return _NAME.sub(
+            lambda found: found[0] if found[0] in self._home else self.name(found[0]), step.message
+        )
 
     def row(self, row: PromptRow) -> str:
         """Name, states and place of a row: ``apple 4 hot, in fridge 2``."""
@@ -191,10 +196,10 @@ def not_an_action(error: PlanError, codec: Codec) -> str:
     return f"Not an action: {reason}{also}"
 
 
-def left_out(found: int, most: int) -> str:
-    """Sentence about an answer with more calls than are carried out at once."""
-    done = "one was" if most == 1 else f"{most} were"
-    return f"Of {found} actions, the first {done} carried out, and the others left out."
+def left_out(found: int, tried: int) -> str:
+    """Sentence about an answer with more calls than were tried."""
+    done = "one was" if tried == 1 else f"{tried} were"
+    return f"Of {found} actions, the first {done} tried, and the others left out."
 
 
 def observation_text(
@@ -214,8 +219,8 @@ def observation_text(
         return _in_names(wording, steps, new, changed, situation, notes)
     lines = [*notes]
     for step in steps:
-        outcome = "" if step.failure is None else f"failed ({step.failure}): "
-        lines.append(f"{wording.call(step.call)}: {outcome}{wording.sentence(step.message)}")
+        failed = "" if step.failure is None else f"failed ({step.failure}): "
+        lines.append(f"{wording.call(step.call)}: {failed}{wording.outcome(step)}")
     if new:
         lines.append(f"New: {'; '.join(map(wording.row, new))}")
     if changed:

@@ -10,7 +10,8 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import Any, Final, cast
 
@@ -82,13 +83,12 @@ def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
 def parse_answer(text: str, profile: Profile = Profile.PAPER) -> tuple[Plan, bool]:
     """Return the calls of an answer within an episode, and whether ``DONE`` follows them.
 
-    The forms are those of a plan, and a JSON object with one call. ``DONE`` is a line, or the action of a JSON call; what
-    follows it is left out. Raises PlanError, and no other exception, for a text with neither.
+    The forms are those of a plan, and JSON objects with one call each, one after another. ``DONE`` is a line, or the action of
+    a JSON call; what follows it is left out. Raises PlanError, and no other exception, for a text with neither.
     """
     answer = _answer_in(text)
-    value = last_json_plan(answer, json.JSONDecoder(), _calls_in)
-    if value is not None:
-        values = _calls_in(value) or ()
+    values = _json_calls(answer)
+    if values is not None:
         before = [*itertools.takewhile(lambda step: not _is_done(step), values)]
         done = len(before) < len(values)
         return (plan_from_json(before, profile) if before or not done else ()), done
@@ -201,16 +201,29 @@ def _steps_in(value: object) -> Sequence[object] | None:
     return None
 
 
-def last_json_plan(
-    text: str,
-    decoder: json.JSONDecoder,
-    calls_in: Callable[[object], Sequence[object] | None] = _steps_in,
-) -> object | None:
-    """Return the last outermost JSON value that holds a plan. Reads about ``_READ_TIMES`` times the text at most.
+def _json_calls(answer: str) -> Sequence[object] | None:
+    """Return the last calls in JSON: those of an array, or of objects with nothing but commas and spaces between them."""
+    found: Sequence[object] | None = None
+    ended, is_single = 0, False
+    for start, end, value in _json_values(answer, json.JSONDecoder()):
+        calls = _calls_in(value)
+        if calls is None:
+            continue
+        was_single, is_single = is_single, isinstance(value, dict) and _steps_in(value) is None
+        follows = was_single and is_single and not answer[ended:start].strip(" \t\r\n,;")
+        found = [*(found or ()), *calls] if follows else calls
+        ended = end
+    return found
 
-    ``calls_in`` returns the calls in a value, None for one without.
-    """
-    found: object | None = None
+
+def last_json_plan(text: str, decoder: json.JSONDecoder) -> object | None:
+    """Return the last outermost JSON value that holds a plan. Reads about ``_READ_TIMES`` times the text at most."""
+    plans = (value for _, _, value in _json_values(text, decoder) if _steps_in(value) is not None)
+    return next(iter(deque(plans, maxlen=1)), None)
+
+
+def _json_values(text: str, decoder: json.JSONDecoder) -> Iterator[tuple[int, int, object]]:
+    """Yield the outermost JSON arrays of objects and objects, each with its start and end in the text."""
     position, left = 0, _READ_TIMES * len(text)
     for _ in range(_MAX_STARTS):
         match = _JSON_START.search(text, position)
@@ -222,9 +235,7 @@ def last_json_plan(
             left -= _end_of_failure(error, text) - match.start()
             position = match.start() + 1
             continue
-        if calls_in(value) is not None:
-            found = value
-    return found
+        yield match.start(), position, value
 
 
 def _end_of_failure(error: Exception, text: str) -> int:

@@ -82,17 +82,23 @@ def judged(bench, answers, setup):
 
 
 class Talker(ChatServer):
-    """Model that says the next of its lines, however often it is asked, and fails after ``most`` answers."""
+    """Model that says the next of its lines, however often it is asked.
 
-    def __init__(self, lines, most=99):
+    It fails after ``most`` answers, and its context has room for ``room`` answers of a conversation.
+    """
+
+    def __init__(self, lines, most=99, room=99):
         super().__init__("")
         self.lines = lines
         self.most = most
+        self.room = room
 
     def next_answer(self, request):
         self.requests.append(request)
         if len(self.requests) > self.most:
             return (500, {}, "out of order", 0.0)
+        if len(request["messages"]) >= 2 * (self.room + 1):
+            return (400, {}, "maximum context length is 64 tokens", 0.0)
         turn = sum(message["role"] == "assistant" for message in request["messages"])
         return (200, {}, json.dumps(completion(self.lines[turn])), 0.0)
 
@@ -137,6 +143,17 @@ def test_no_answer_is_bought_twice(apple, tmp_path):
     answers = ask(again, exam_of(apple), tmp_path, setup)
     assert len(again.requests) == 3
     assert judged(apple, answers, setup)[0]["overall"]["success"]["value"] == 1.0
+
+
+def test_conversation_that_outgrows_the_context_ends_its_episode_alone(bench, tmp_path):
+    server, setup = Talker(("move 0", "move 1", "move 0", "move 1"), room=3), setup_of(bench)
+    answers = ask(server, exam_of(bench), tmp_path, setup)
+    assert [len(json.loads(answer.text)) for answer in answers] == [3] * len(bench.records)
+
+
+def test_endpoint_that_refuses_the_first_question_is_told(apple, tmp_path):
+    with pytest.raises(TrainerError, match="answered 400"):
+        ask(Talker(SOLVED, room=0), exam_of(apple), tmp_path, setup_of(apple))
 
 
 def test_searching_oracle_finds_what_it_does_not_see(bench, tmp_path):

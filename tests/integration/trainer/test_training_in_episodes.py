@@ -12,8 +12,11 @@ from rich.console import Console
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.small_llama import save_small_llama
 
-from embomatrix.envs.rules import EpisodeEnd
+from embomatrix.envs.rules import EpisodeEnd, EpisodeReward
+from embomatrix.reward.hierarchy import unparsable
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.episodes import TurnFailedError
+from embomatrix.rpc.status import DeadlineError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.skills.parse import DONE, parse_plan
 from embomatrix.trainer.cluster.gateway import Gateway
@@ -146,6 +149,8 @@ def test_each_answer_has_its_step_advantage(cluster, tasks, tmp_path, monkeypatc
     if kind == "language model":
         save_small_llama(tasks.train, tmp_path / "model")
         changes |= {"model": str(tmp_path / "model"), "codec": "lines", "episodes__answer_tokens": 6}
+        # Its random words change no reward, but failures cost something.
+        changes["episodes__failure_cost"] = 0.25
     compared = []
     token_advantages = AnswerStates.token_advantages
 
@@ -186,20 +191,31 @@ def test_dashboard_gets_episodes_turn_by_turn(cluster, tasks, tmp_path, monkeypa
         ]
 
 
-def test_a_turn_without_a_result_loses_the_episode_and_not_the_run():
+@pytest.mark.parametrize(
+    ("error", "lost"),
+    [
+        (
+            TurnFailedError("three attempts failed", InfraFailure(InfraCode.SLOT_CRASHED, "it crashed")),
+            "slot_crashed: it crashed",
+        ),
+        (DeadlineError("no result within 120 s"), "deadline: no result within 120 s"),
+    ],
+)
+def test_a_turn_without_a_result_loses_the_episode_and_not_the_run(error, lost):
     class Player:
         end = None
         state = "start"
         steps = ()
+        reward = EpisodeReward(unparsable(PAPER))
 
         async def answer(self, text):
-            raise TurnFailedError("three attempts failed", InfraFailure(InfraCode.SLOT_CRASHED, "it crashed"))
+            raise error
 
     episode = ClusterEpisode(Player())
     assert asyncio.run(episode.answer("move 1")) == ""
     assert episode.is_over
     outcome = episode.outcome()
-    assert (outcome.text, outcome.reward, outcome.lost) == ("move 1", None, "slot_crashed: it crashed")
+    assert (outcome.text, outcome.reward, outcome.lost) == ("move 1", None, lost)
 
 
 def test_episodes_of_the_oracle_are_played_again_if_the_run_is_another(cluster, tasks, tmp_path):

@@ -42,6 +42,10 @@ class Kitchen:
         steps, changes, success = [], [], False
         for call in calls:
             words = f"{call.skill} {call.object_index}"
+            if call.room_name:
+                sentence = f"there is no room {call.room_name}: the rooms are kitchen_0, bedroom_0"
+                steps.append(Step(call, FailureReason.UNKNOWN_ROOM, sentence))
+                break
             if words == "pick_up 3":
                 sentence = "bed_1 is in the way of milk_1 and of shelf_7"
                 steps.append(Step(call, FailureReason.BLOCKED, sentence, "bed_1"))
@@ -59,14 +63,18 @@ class Kitchen:
         return Turn(tuple(steps), observation, reward, f"sha256:{len(plan)}")
 
 
-def play(answers, rules=FULL, codec=Codec.LINES):
-    """Return the player, its kitchen, the opening prompt and the observations after the answers."""
+def play(answers, rules=FULL, codec=Codec.LINES, *, opens=False):
+    """Return the player, its kitchen, the opening prompt and the observations after the answers.
+
+    With ``opens``, the fridge and what is in it come into sight after the opening prompt.
+    """
     kitchen = Kitchen()
     start = EpisodeStart("sha256:0", "t", 0, sight=rules.visibility is Visibility.SEEN)
     player = EpisodePlayer(RunningEpisode(start, kitchen.take_turn), SITUATION, rules, codec)
 
     async def run():
         prompt = await player.begin()
+        kitchen.opened = opens
         return prompt, [await player.answer(text) for text in answers]
 
     prompt, observations = asyncio.run(run())
@@ -118,6 +126,42 @@ def test_unseen_row_is_refused_like_one_that_does_not_exist():
     assert dataclasses.replace(unseen.steps[0], call=None, message="") == dataclasses.replace(
         absent.steps[0], call=None, message=""
     )
+
+
+def test_a_room_that_is_none_does_not_tell_whether_an_object_of_its_name_exists():
+    _, _, _, observations = play(["go_to_room milk_1", "go_to_room milk_9", "go_to_room apple_1"], SEEN)
+    for observation, word in zip(observations, ("milk_1", "milk_9", "apple_1"), strict=True):
+        assert observation.text.startswith(
+            f"go_to_room {word}: failed (unknown_room): there is no room {word}: the rooms are kitchen_0, bedroom_0\n"
+        )
+
+
+def test_messages_have_the_words_of_the_text():
+    _, _, _, (failed,) = play(["pick_up 3"], FULL)
+    assert failed.messages == ("bed 4 is in the way of milk 3 and of shelf",)
+    assert failed.steps[0].message == "bed_1 is in the way of milk_1 and of shelf_7"
+
+
+def test_calls_with_things_that_their_own_answer_found_are_left_out_and_cost_nothing():
+    several = EpisodeRules(Visibility.SEEN, calls_per_answer=4)
+    _, kitchen, _, (found,) = play(["turn 1\npick_up 3\nmove 0\ndone"], several, opens=True)
+    assert [call.skill for call in kitchen.executed] == ["turn"]
+    assert found.text.startswith("Of 3 actions, the first one was tried, and the others left out.\n")
+    assert "New: fridge 2" in found.text
+    assert "unknown_index" not in found.text
+    assert (found.reward.calls, found.reward.failures, found.end) == (1, 0, None)
+
+
+def test_note_counts_the_calls_that_were_tried():
+    _, _, _, (failed,) = play(["pick_up 3\nmove 0\nmove 1"], EpisodeRules(calls_per_answer=2))
+    assert failed.text.startswith("Of 3 actions, the first one was tried, and the others left out.\n")
+
+
+def test_a_word_alone_names_no_object_of_which_others_may_be_unseen():
+    _, _, prompt, (short, full) = play(["move apple", "move apple_1"], SEEN, codec=Codec.NAMES)
+    assert "apple_1" in prompt.user
+    assert short.text.startswith("failed")
+    assert full.text.startswith("did")
 
 
 def test_new_things_are_told_once_with_what_holds_them():
@@ -184,7 +228,7 @@ def test_answers_that_are_no_call_are_told_so():
         "Not an action: expected one on a line of its own, such as open 2, or done\n"
     )
     assert two.text.startswith(
-        "Of 2 actions, the first one was carried out, and the others left out.\nmove 0: did it to table 0\n"
+        "Of 2 actions, the first one was tried, and the others left out.\nmove 0: did it to table 0\n"
     )
     assert wrong.text.startswith(
         "Not an action: object_index is 1.5: expected a whole number, that of an object\n"

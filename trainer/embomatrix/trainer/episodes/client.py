@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from embomatrix.envs.player import EpisodePlayer
 from embomatrix.envs.rules import EpisodeEnd
 from embomatrix.rpc.episodes import TurnFailedError
+from embomatrix.rpc.status import DeadlineError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.skills.prompt import Codec, Prompt
 from embomatrix.skills.syntax import MAX_STEPS
@@ -50,6 +51,8 @@ class ClusterEpisode:
         """Answers that got an observation."""
         self.states: list[Hashable] = []
         """State before each answer."""
+        self.rewards_before: list[float] = []
+        """Reward before each answer."""
         self.policy_answers = 0
         """Answers of the policy before another took over."""
         self.lost: InfraFailure | None = None
@@ -86,6 +89,7 @@ class ClusterEpisode:
         """Take an answer and return the observation. Raises ClusterError if the manager can't be reached."""
         self.answers.append(text)
         self.states.append(self.player.state)
+        self.rewards_before.append(self.player.reward.total)
         observation = await self._try(lambda: self.player.answer(text))
         if observation is None:
             return ""
@@ -104,6 +108,8 @@ class ClusterEpisode:
             self.lost = error.failure or InfraFailure(InfraCode.WORKER_LOST, str(error))
         except PrefixMismatchError as error:
             self.lost = InfraFailure(InfraCode.PREFIX_MISMATCH, str(error))
+        except DeadlineError as error:
+            self.lost = InfraFailure(InfraCode.DEADLINE, str(error))
         return None
 
     def outcome(self) -> PlanOutcome:

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import itertools
 import json
+import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from embomatrix.envs.player import EpisodePlayer
 from embomatrix.envs.rules import Visibility
 from embomatrix.llm.cassette import Cassette
 from embomatrix.llm.ledger import Ledger
-from embomatrix.llm.values import ChatModel, ChatRequest, LlmError, Message, Reply, Speaker
+from embomatrix.llm.values import ChatModel, ChatRequest, EndpointError, LlmError, Message, Reply, Speaker
 from embomatrix.scripts.searching import PlacePriors, SearchingScript
 from embomatrix.skills.parse import DONE, plan_to_lines
 from embomatrix.skills.prompt import Codec, Prompt, prompt_for
@@ -45,6 +46,10 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.world.task import Task
 
+logger = logging.getLogger(__name__)
+
+_TOO_LONG: Final = frozenset({400, 413, 422})
+"""HTTP statuses with which endpoints refuse a conversation that is longer than the model's context."""
 TURNS_FILE: Final = "turns.jsonl"
 """Answers of a model within episodes, as they arrive."""
 
@@ -194,7 +199,7 @@ class ChatAgent:
     async def answer(
         self, system: str, observations: Sequence[str], answers: Sequence[str], player: EpisodePlayer
     ) -> AgentReply:
-        """Ask the model. Raises LlmError."""
+        """Ask the model. An endpoint that takes the conversation no more ends the episode. Raises LlmError."""
         turns = itertools.chain.from_iterable(
             itertools.zip_longest(
                 (Message(Speaker.USER, text) for text in observations),
@@ -202,15 +207,22 @@ class ChatAgent:
             )
         )
         messages = [Message(Speaker.SYSTEM, system), *filter(None, turns)]
-        reply = await self._model.complete(
-            ChatRequest(
-                PURPOSE,
-                tuple(messages),
-                max_tokens=self._setup.max_tokens,
-                temperature=self._setup.temperature,
-                seed=self._seed,
-            )
+        request = ChatRequest(
+            PURPOSE,
+            tuple(messages),
+            max_tokens=self._setup.max_tokens,
+            temperature=self._setup.temperature,
+            seed=self._seed,
         )
+        try:
+            reply = await self._model.complete(request)
+        except EndpointError as error:
+            # It took the conversation before: now it has become longer than the model's context.
+            if not answers or error.status not in _TOO_LONG:
+                raise
+            logger.warning("an episode ends after %d answers: %s", len(answers), error)
+            player.stop()
+            return AgentReply("")
         return AgentReply(reply.text, reply.finish, reply.usage.prompt_tokens, reply.usage.completion_tokens)
 
 

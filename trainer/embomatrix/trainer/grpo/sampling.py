@@ -230,7 +230,11 @@ class EpisodeSampler(Sampler):
             played.samples,
             _mask_of(played.samples, self._settings),
             futures,
-            states=AnswerStates(self._step_rule, [each.states for each in played.episodes])
+            states=AnswerStates(
+                self._step_rule,
+                [each.states for each in played.episodes],
+                [each.rewards_before for each in played.episodes],
+            )
             if self._step_rule
             else None,
             waited_s=played.waited_s if here else 0.0,
