@@ -149,6 +149,8 @@ def test_conversation_that_outgrows_the_context_ends_its_episode_alone(bench, tm
     server, setup = Talker(("move 0", "move 1", "move 0", "move 1"), room=3), setup_of(bench)
     answers = ask(server, exam_of(bench), tmp_path, setup)
     assert [len(json.loads(answer.text)) for answer in answers] == [3] * len(bench.records)
+    result = exam_of(bench).judge(setup, answers, lambda *_: None)
+    assert {verdict.reason for task in result.board.tasks for verdict in task.verdicts} == {"tokens"}
 
 
 def test_endpoint_that_refuses_the_first_question_is_told(apple, tmp_path):
@@ -182,7 +184,7 @@ def test_searching_oracle_finds_what_it_does_not_see(bench, tmp_path):
         (["move 99", "done"], Cause.HALLUCINATED_OBJECT, "unknown_index"),
         (["hm", "hm", "hm", "hm"], Cause.UNPARSABLE, "loop"),
         (["move 10", "move 0"] * 20, Cause.GOAL_NOT_MET, "calls"),
-        ([], Cause.UNPARSABLE, "unfinished"),
+        ([], Cause.UNPARSABLE, "tokens"),
     ],
 )
 def test_end_of_an_episode_decides_its_cause(apple, texts, cause, reason):

@@ -154,15 +154,23 @@ def play_episodes(
     sheet: AnswerSheet,
     on_progress: OnProgress,
     within: Callable[[], AbstractAsyncContextManager[object]] = contextlib.nullcontext,
+    concurrent: int | None = None,
 ) -> None:
     """Play the episodes that the sheet lacks, each by its own agent, and store their answers.
 
-    Raises TrainerError with the number of stored episodes if a model does not answer, ClusterError and EngineError.
+    At most ``concurrent`` agents are at work at a time, by default all of the scenes in use. Raises TrainerError with the
+    number of stored episodes if a model does not answer, ClusterError and EngineError.
     """
     total = len(questions) * sheet.setup.samples
     keys = [(question.task_id, sample) for question in questions for sample in range(sheet.setup.samples)]
 
+    gate = contextlib.nullcontext() if concurrent is None else asyncio.Semaphore(concurrent)
+
     async def play(task_id: str, sample: int, prompt: Prompt, player: EpisodePlayer) -> None:
+        async with gate:
+            await play_one(task_id, sample, prompt, player)
+
+    async def play_one(task_id: str, sample: int, prompt: Prompt, player: EpisodePlayer) -> None:
         agent = agent_of(task_id, sample)
         answers: list[AgentReply] = []
         observations = [prompt.user]
@@ -327,6 +335,8 @@ class EpisodeExam:
                 if player.end is not None:
                     break
                 await player.answer(text)
+            # A stored episode without an end is one whose agent had no room for another answer.
+            player.stop()
             key = (task_id, sample)
             verdicts[key] = episode_verdict(tasks[task_id], sample, player)
             plans[key] = tuple(step.call for step in player.steps if step.ok)
@@ -370,7 +380,7 @@ def episode_verdict(task: Task, sample: int, player: EpisodePlayer) -> AnswerVer
         cause = Cause.UNPARSABLE
     else:
         cause = cause_of_trace(tuple(step.call for step in player.steps), player.steps, task.table)
-    ended = player.end.value if player.end is not None else "unfinished"
+    ended = "" if player.end is None else player.end.value
     return AnswerVerdict(
         task.task_id,
         sample,

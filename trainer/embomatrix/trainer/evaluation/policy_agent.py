@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.prompt import Prompt
 from embomatrix.trainer.evaluation.answer_sources import OnProgress, seed_of
@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.chat_rows import ChatRows
     from embomatrix.trainer.policy.episode_rows import EpisodeRows
     from embomatrix.trainer.policy.protocol import Policy
+
+
+CONCURRENT: Final = 16
+"""Episodes that a policy plays at a time: enough to answer in one while the others are executed. Each has a cache."""
 
 
 class PolicyAgent:
@@ -64,4 +68,4 @@ def converse_in_episodes(
     def agent_of(task_id: str, sample: int) -> PolicyAgent:
         return PolicyAgent(policy, sheet.setup, task_id, sample)
 
-    play_episodes(stage, agent_of, questions, sheet, on_progress)
+    play_episodes(stage, agent_of, questions, sheet, on_progress, concurrent=CONCURRENT)
