@@ -8,8 +8,10 @@ import pytest
 from tests.fakes.real_cluster import RealCluster, connected
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
-from embomatrix.envs import EpisodeEnd, EpisodeRules, Visibility, make
+from embomatrix.envs import EpisodeEnd, EpisodeRules, Visibility, make, simulation
 from embomatrix.reward.settings import RewardSettings
+from embomatrix.rpc.admin_client import AdminClient
+from embomatrix.rpc.status import ClusterError
 from embomatrix.skills.episode_text import FORMAT
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord, write_dataset
@@ -63,6 +65,28 @@ def test_cluster_and_process_tell_the_same(dataset, tmp_path, visibility):
         with make(dataset, visibility=visibility, manager=cluster.address) as environment:
             far = played(environment)
     assert far == near
+
+
+def test_environment_outlives_a_run_that_the_manager_closed_because_it_was_idle(
+    dataset, tmp_path, monkeypatch
+):
+    async def close_runs():
+        async with AdminClient(cluster.address) as client:
+            for run in await client.list_runs():
+                await client.close_run(run.run_id)
+
+    with RealCluster(tmp_path) as cluster:
+        cluster.start_manager()
+        cluster.start_real_worker("w1")
+        asyncio.run(ready(cluster))
+        with make(dataset, manager=cluster.address) as environment:
+            first = played(environment)
+            asyncio.run(close_runs())
+            environment.reset(environment.task_ids[0], seed=3)
+            with pytest.raises(ClusterError):  # an operator closed a run that is in use
+                environment.step("move 1")
+            monkeypatch.setattr(simulation, "QUIET_S", -1.0)
+            assert played(environment) == first
 
 
 def test_closed_container_shows_its_contents_once_it_is_open(dataset):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
+import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from embomatrix.world.dataset import Dataset, TaskRecord
 
 RUN_NAME: Final = "episodes"
+QUIET_S: Final = 3600.0
+"""After so long without a turn, the next episode begins in a new run: the manager closes runs that are idle for hours."""
 
 logger = logging.getLogger(__name__)
 
@@ -59,16 +63,28 @@ class ClusterSimulation:
         self._dataset = dataset
         self._connect = connect
         self._stack = contextlib.AsyncExitStack()
+        self._run = contextlib.AsyncExitStack()
+        """What is closed with the run."""
+        self._opening = asyncio.Lock()
         self._sent: set[str] = set()
         self._announced = 0
 
     async def open(self) -> None:
         self._client = await self._stack.enter_async_context(self._connect())
+        await self._open_run()
+
+    async def _open_run(self) -> None:
         self._run_id = await self._client.open_run(RUN_NAME, terms=RunTerms(reward=self.reward))
-        self._stack.push_async_callback(self._client.close_run, self._run_id)
-        self._episodes = await self._stack.enter_async_context(Episodes(self._client, self._run_id))
+        self._run.push_async_callback(self._client.close_run, self._run_id)
+        self._episodes = await self._run.enter_async_context(Episodes(self._client, self._run_id))
+        self._sent.clear()
 
     async def begin(self, record: TaskRecord, seed: int, *, sight: bool) -> RunningEpisode:
+        async with self._opening:
+            if time.monotonic() - self._episodes.used_s > QUIET_S:
+                with contextlib.suppress(ClusterError):  # the manager may have closed it
+                    await self._run.aclose()
+                await self._open_run()
         await self._send(record.bundle_digest)
         return self._episodes.begin(record.bundle_digest, record.task.task_id, seed, sight=sight)
 
@@ -94,4 +110,7 @@ class ClusterSimulation:
             self._sent.add(digest)
 
     async def close(self) -> None:
-        await self._stack.aclose()
+        try:
+            await self._run.aclose()
+        finally:
+            await self._stack.aclose()

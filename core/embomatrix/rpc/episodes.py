@@ -74,6 +74,8 @@ class Episodes:
         self._waiting: deque[_AwaitedTurn] = deque()
         self._sending: set[asyncio.Task[None]] = set()
         self._gathering = False
+        self.used_s = time.monotonic()
+        """Monotonic time of the latest turn, or of the beginning."""
 
     async def __aenter__(self) -> Self:
         return self
@@ -101,6 +103,7 @@ class Episodes:
     async def _take_turn(
         self, start: EpisodeStart, plan: Plan, prefix: EpisodePrefix, *, advise: bool = False
     ) -> Turn:
+        self.used_s = time.monotonic()
         name = str(next(self._numbers))
         rollout = Rollout(
             name,
