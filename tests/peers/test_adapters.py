@@ -1,12 +1,16 @@
 """Adapters of other trainers on a real cluster: a manager, a worker with physics, and the examples in docs/."""
 
+import asyncio
 import json
+import os
 import re
+import shlex
 
 import pytest
+from tests.fakes.chat_server import ChatServer
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.documents import snippets
-from tests.fakes.peers import EXAMPLES, Peer
+from tests.fakes.peers import EXAMPLES, ROOTS, Peer
 from tests.fakes.real_cluster import RealCluster, connected
 
 pytestmark = [pytest.mark.peers, pytest.mark.timeout(1800)]
@@ -174,6 +178,8 @@ async def test_trl_block_of_the_readme_trains(cluster, dataset, tmp_path):
     assert "embomatrix/success" in printed
 
 
+VERIFIERS_PEER = ("verifiers", "verifiers==0.4.0", "uv==0.13.9")
+"""Its harnesses start programs with uv."""
 VERIFIERS = """
 import asyncio, json, sys
 sys.path.append(sys.argv[2])
@@ -206,12 +212,56 @@ asyncio.run(main())
 
 
 async def test_verifiers_scores_replies(cluster, dataset):
-    peer = Peer("verifiers", "verifiers==0.4.0")
+    peer = Peer(*VERIFIERS_PEER)
     printed = peer.run("-c", VERIFIERS, dataset, EXAMPLES, EMBOMATRIX_MANAGER=cluster[0].address)
     rows = [json.loads(line) for line in printed.splitlines()]
     assert [each["success"] for each in rows] == [1, 1, 1, 0, 0, 0]
     assert all(each["total"] > 30 for each in rows[:3])
     assert [each["total"] for each in rows[3:]] == [-1, -1, -1]
+
+
+class StreamingModel(ChatServer):
+    """Model that says the next of its lines in each conversation, as a stream: the harnesses of verifiers ask for one."""
+
+    lines = ("I look around.", "move 10", "pick_up 10", "move 0", "place 0 ontop", "done")
+
+    def next_answer(self, request):
+        turn = sum(message["role"] == "assistant" for message in request["messages"])
+        head = {"id": "x", "object": "chat.completion.chunk", "created": 1, "model": "scripted"}
+        said = {"role": "assistant", "content": self.lines[turn]}
+        usage = {"prompt_tokens": 9, "completion_tokens": 2, "total_tokens": 11}
+        chunks = (
+            {**head, "choices": [{"index": 0, "delta": said, "finish_reason": None}]},
+            {**head, "choices": [{"index": 0, "delta": {}, "finish_reason": "stop"}]},
+            {**head, "choices": [], "usage": usage},
+        )
+        body = "".join(f"data: {json.dumps(chunk)}\n\n" for chunk in chunks)
+        return (200, {"content-type": "text/event-stream"}, f"{body}data: [DONE]\n\n", 0.0)
+
+
+async def test_verifiers_own_command_plays_episodes(cluster, dataset, tmp_path):
+    peer = Peer(*VERIFIERS_PEER)
+    (block,) = (text for text in snippets("adapters.md", "verifiers", "") if "embomatrix-episodes" in text)
+    printed = shlex.split(block.split("vf-eval ")[1])
+    assert "search" in printed
+    command = [
+        str(dataset) if word == "search" else "scripted" if word == "MODEL" else word for word in printed
+    ]
+    command += ["--no-push", "--select.include.ids", "apple_to_counter", "-o", str(tmp_path)]
+    with StreamingModel("").serving() as url:
+        await asyncio.to_thread(
+            peer.run,
+            *("-c", "from verifiers.v1.cli.eval.main import main; main()", *command),
+            *("--client.base-url", url),
+            PYTHONPATH=os.pathsep.join(map(str, (*ROOTS, EXAMPLES))),
+            PATH=f"{peer.folder / 'bin'}:{os.environ['PATH']}",
+            EMBOMATRIX_MANAGER=cluster[0].address,
+            PRIME_API_KEY="none",
+        )
+    (line,) = next(tmp_path.glob("*/traces.jsonl")).read_text().splitlines()
+    (trace,) = json.loads(line)["traces"]
+    assert (trace["errors"], trace["metrics"]) == ([], {"success": 1.0, "calls": 5.0, "failed_calls": 1.0})
+    assert sum(reward["score"] for reward in trace["rewards"].values()) > 30
 
 
 VERL = """

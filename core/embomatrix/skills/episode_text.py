@@ -80,7 +80,8 @@ def opening(situation: Situation, codec: Codec, *, seen: bool, at_once: int) -> 
     if codec is Codec.NAMES:
         return Prompt("", f"rooms {' '.join(situation.home)}\n{prompt.user}") if seen else prompt
     rooms = f"Rooms: {', '.join(situation.home)}\n" if seen else ""
-    return Prompt(_system(codec, situation.profile, seen=seen, at_once=at_once), rooms + prompt.user)
+    system = system_for_answers(codec, situation.profile, seen=seen, at_once=at_once)
+    return Prompt(system, rooms + prompt.user)
 
 
 def system_for_tools(profile: Profile, *, seen: bool) -> str:
@@ -92,7 +93,8 @@ def system_for_tools(profile: Profile, *, seen: bool) -> str:
     )
 
 
-def _system(codec: Codec, profile: Profile, *, seen: bool, at_once: int) -> str:
+def system_for_answers(codec: Codec, profile: Profile, *, seen: bool, at_once: int) -> str:
+    """System text for a language model that writes its calls, at most ``at_once`` in an answer."""
     call, end = EXAMPLES[codec]
     form = _FORMS[codec, at_once > 1].format(count=at_once)
     actions = (
