@@ -97,7 +97,10 @@ async def test_page_of_training_shows_curves_and_plans_and_runs_no_script_of_a_m
     sampled = page.words["sampled"]
     assert sampled.startswith("reached the goal · reward 30.90 (format 0.50, relevance 0.40, goal 30.00)")
     assert "pick_up holds the vase place it is closed" in sampled
-    assert f"infrastructure failure, no reward · t1 worker_lost: it went silent {script}" in sampled
+    assert (
+        f"infrastructure failure, no reward · t1 Watch call by call worker_lost: it went silent {script}"
+        in sampled
+    )
 
 
 async def test_training_page_without_reports_shows_the_command(browser, tmp_path):

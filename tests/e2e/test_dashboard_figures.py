@@ -125,6 +125,10 @@ def _count(number):
     return f"{number:,}"
 
 
+def _counted(number, noun, ending="s"):
+    return f"{_count(number)} {noun}{'' if number == 1 else ending}"
+
+
 def _rate(per_second):
     recent = sum(per_second[-10:]) / 10
     return _count(int(recent + 0.5)) if recent >= 100 else f"{recent:.1f}"
@@ -144,10 +148,10 @@ def _overview(seen):
         "rate": _rate(now["throughput"]),
         "peak": f"peak {_count(max(now['throughput']))}, {_count(now['outcomes']['completed'])} in total",
         "slots": f"{now['slots_at_work']:.1f}/{now['slots']}",
-        "slotsnote": f"mean of a minute; {_count(now['queued'])} rollouts queued",
+        "slotsnote": f"mean of a minute; {_counted(now['queued'], 'rollout')} queued",
         "overhead": f"{100 * overhead:.{1 if overhead < 0.1 else 0}f} %" if overhead else "–",
         "bad": _count(sum(_failed(now["outcomes"]).values())),
-        "badnote": f"{_count(now['redispatched'])} re-dispatched, {_count(now['stale_results'])} late",
+        "badnote": f"{_counted(now['redispatched'], 're-dispatch', 'es')}, {_counted(now['stale_results'], 'late result')}",
         "runs": (
             "evening",
             _count(stats["delivered"]),
@@ -191,7 +195,7 @@ def _failures(seen):
     failed, again = sum(_failed(now["outcomes"]).values()), now["redispatched"]
     return {
         "sum": f"{_count(failed)} rollouts ended in an infrastructure failure, which is never scored as a reward. "
-        f"{_count(again)} rollout{' was' if again == 1 else 's were'} re-dispatched after a lease that failed or expired.",
+        f"Rollouts were leased again {_counted(again, 'time')}, after a lease that failed or expired.",
         "reasons": {name: _count(n) for name, n in _failed(now["outcomes"]).items()},
         "listed": f"the latest {len(now['failures'])} of {_count(failed)}",
     }
@@ -304,12 +308,12 @@ async def _assert_run_page_agrees(opened, http, run_id, calm):
     totals = {total["name"]: total["value"] for total in (await http.get(f"runs/{run_id}")).json()["totals"]}
     assert totals["completed rollouts"] == calm["outcomes"]["completed"]
     assert totals["infrastructure failures"] == calm["failed"]
-    assert totals["re-dispatched rollouts"] == calm["redispatched"]
+    assert totals["re-dispatches"] == calm["redispatched"]
     await opened.open(f"runs?{run_id}")
     await opened.until("#totals", "completed rollouts")
     tiles = await opened.page.locator("#totals .tile").all_inner_texts()
     shown = {name.lower(): value for name, value in (text.split("\n", 1) for text in tiles)}
-    for name in ("completed rollouts", "infrastructure failures", "re-dispatched rollouts"):
+    for name in ("completed rollouts", "infrastructure failures", "re-dispatches"):
         assert shown[name].strip() == _count(totals[name])
     rows = await opened.page.evaluate(ROWS, "work")
     assert sum(int(row[1].replace(",", "")) for row in rows) == totals["completed rollouts"]
@@ -326,7 +330,7 @@ async def _assert_reports_agree(opened, cluster, calm, folder):
     tile = await opened.words("section.tile:has-text('Completed')")
     assert tile.endswith(
         f"{_count(calm['outcomes']['completed'])} {_count(calm['failed'])} failed, "
-        f"{_count(calm['redispatched'])} rollouts re-dispatched"
+        f"{_counted(calm['redispatched'], 're-dispatch', 'es')}"
     )
     assert "every lease brought a result" not in await opened.words("#failures")
     async with httpx.AsyncClient(trust_env=False) as http:

@@ -123,8 +123,8 @@ async def test_page_of_a_closed_run_tells_its_story_and_is_saved_as_one_file(bro
         assert "1 worker completed 8 rollouts; 1 rollout ended in an infrastructure failure." in story
         assert "scene_load_failed" in await opened.words("#lost")
         assert (
-            f"did not reach the goal · reward 15.70 (format 0.50, relevance 0.20, goal 15.00) · advantage 1.00 · t1 {SCRIPT}"
-            in await opened.words("#sampled")
+            f"did not reach the goal · reward 15.70 (format 0.50, relevance 0.20, goal 15.00) · advantage 1.00 · t1 "
+            f"Watch call by call {SCRIPT}" in await opened.words("#sampled")
         )
         async with page.expect_download() as waiting:
             await page.get_by_role("button", name="Download report").click()

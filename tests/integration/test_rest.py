@@ -123,14 +123,16 @@ async def test_completed_rollouts_of_a_lost_worker_stay_counted(tmp_path):
     async with (
         manager(tmp_path) as at,
         open_run(at.address) as client,
-        FakeWorker(at.address, "w1") as gone,
+        FakeWorker(at.address, "w1", host=HostUse(0.25, 4000, 16_000)) as gone,
         http_at(at) as http,
     ):
+        await seen_until(http, lambda seen: any(row["host"] for row in seen["workers"]["items"]))
         await outcomes(client, batch(10))
         await gone.kill()
         seen = await seen_until(http, lambda seen: "lost" in seen["overview"]["workers"])
     (worker,) = seen["workers"]["items"]
     assert (worker["state"], worker["completed"]) == ("lost", 10)
+    assert worker["host"] is None, "nobody knows how much its machine does now"
     assert seen["overview"]["outcomes"] == {"completed": 10}
 
 
@@ -157,6 +159,7 @@ async def test_rest_commands_equal_the_grpc_commands(tmp_path):
         assert (await http.post(f"{PREFIX}/workers/w1/drain")).json()["state"] == "draining"
         first = (await http.get(f"{PREFIX}/workers")).json()["items"][0]
         assert (first["worker_id"], first["state"] in ("draining", "left")) == ("w1", True)
+        assert (await http.post(f"{PREFIX}/workers/w2/resume")).json() == {"thing": "w2", "state": "ready"}
         unknown = await http.post(f"{PREFIX}/workers/nobody/drain")
         assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
         assert (await http.post(f"{PREFIX}/workers/w2/revoke", json={})).status_code == 422
@@ -175,8 +178,47 @@ async def test_invalid_page_parameters_are_refused(tmp_path):
     async with manager(tmp_path) as at, http_at(at) as http:
         answers = [await http.get(f"{PREFIX}/{query}") for query in queries]
     assert [answer.status_code for answer in answers] == [422] * len(queries)
-    named = [answer.json()["detail"][0]["loc"] for answer in answers]
-    assert named == [["query", name] for name in ("limit", "limit", "offset", "limit", "after")]
+    named = [answer.json()["detail"].split(":")[0] for answer in answers]
+    assert named == [f"query {name}" for name in ("limit", "limit", "offset", "limit", "after")]
+    assert answers[0].json() == {
+        "detail": "query limit: input should be greater than or equal to 1, found '0'"
+    }
+
+
+async def test_every_invalid_part_of_a_request_is_named_in_one_sentence(tmp_path):
+    async with manager(tmp_path) as at, http_at(at) as http:
+        both = await http.get(f"{PREFIX}/workers?limit=0&offset=-1")
+        state = await http.get(f"{PREFIX}/workers?state=redy")
+        every = await http.get(f"{PREFIX}/snapshot?state=&search=")
+        body = await http.post(f"{PREFIX}/workers/w1/revoke", json={})
+        text = await http.post(
+            f"{PREFIX}/workers/w1/revoke", content=b"{", headers={"content-type": "application/json"}
+        )
+        described = (await http.get(f"{PREFIX}/openapi.json")).json()["components"]["schemas"]
+    assert {answer.status_code for answer in (both, state, body, text)} == {422}
+    assert both.json()["detail"].count("; ") == 1
+    found = state.json()["detail"]
+    assert found.startswith("query state: input should be 'ready', 'suspect', 'lost',")
+    assert found.endswith("found 'redy'")
+    assert every.status_code == 200
+    assert body.json()["detail"] == "body reason: field required"
+    assert text.json()["detail"].startswith("body 1: JSON decode error")
+    assert ("Refusal" in described, "HTTPValidationError" in described) == (True, False)
+
+
+async def test_whole_names_of_workers_and_ids_of_runs_are_searched(tmp_path):
+    name = "w" * 128
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address, name),
+        FakeWorker(at.address, name),
+        http_at(at) as http,
+    ):
+        for path in ("workers", "runs", f"runs/{name}/timeline"):
+            answer = await http.get(f"{PREFIX}/{path}?search={name}")
+            assert answer.status_code == 200, path
+            assert answer.json().get("total", 1) == 1
+        assert (await http.get(f"{PREFIX}/workers?search={name}x")).status_code == 422
 
 
 async def test_commands_are_refused_to_viewers_and_foreign_origins(tmp_path):
@@ -217,6 +259,28 @@ async def test_event_stream_resumes_after_a_sequence_number(tmp_path):
         assert (await http.get(f"{PREFIX}/events/stream", params={"run": "nobody"})).status_code == 404
     numbers = [event["sequence"] for event in (*first, *rest)]
     assert numbers == sorted(set(numbers))
+
+
+@pytest.mark.parametrize("left_open", [False, True])
+async def test_stream_of_a_run_ends_after_its_last_event(tmp_path, left_open):
+    async def read(http, after=0):
+        params = {"run": "r1", "after": after}
+        async with http.stream("GET", f"{PREFIX}/events/stream", params=params) as answer:
+            lines = [line async for line in answer.aiter_lines()]
+        return [json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: ")]
+
+    async with manager(tmp_path) as at, open_run(at.address) as client, http_at(at) as http:
+        if left_open:
+            reading = asyncio.create_task(read(http))
+            await asyncio.sleep(0.7)
+            await client.close_run("r1")
+        else:
+            await client.close_run("r1")
+            reading = asyncio.create_task(read(http))
+        async with asyncio.timeout(10):
+            events = await reading
+            assert await read(http, after=events[-1]["sequence"]) == []
+    assert [event["kind"] for event in events] == ["run_opened", "run_closed"]
 
 
 @pytest.mark.slow
@@ -389,7 +453,8 @@ async def test_closed_runs_are_listed_by_name_and_keep_story_plans_and_failures(
     assert (body["trained"], untrained["trained"]) == (True, False)
     assert training["phases"] == [{"phase": "grpo", "steps": [1], "figures": {"reward": [2.0]}}]
     assert training["plans"][0]["text"] == "move 3"
-    assert (wrong.status_code, wrong.json()["detail"][0]["loc"]) == (422, ["query", "state"])
+    assert wrong.status_code == 422
+    assert wrong.json()["detail"].startswith("query state: input should be 'open', 'closed' or 'all', found")
 
 
 async def test_machine_and_log_of_a_worker_are_shown_without_secrets(tmp_path):

@@ -4,7 +4,8 @@ import re
 from html.parser import HTMLParser
 
 from embomatrix.cli.cluster.charts import throughput_chart
-from embomatrix.cli.cluster.report import report_page, seconds_text
+from embomatrix.cli.cluster.report import report_page
+from embomatrix.host.durations import seconds_text
 from embomatrix.rpc.wire.run_log import (
     EventKind,
     PhaseSummary,
@@ -108,7 +109,7 @@ def test_chart_colours_are_css_variables_of_the_page():
 def test_report_shows_the_counted_figures():
     words = re.sub(r"<[^>]*>", " ", report_page(summary(), EVENTS))
     words = " ".join(words.split())
-    assert "Completed 3 1 failed, 2 rollouts re-dispatched" in words
+    assert "Completed 3 1 failed, 2 re-dispatches" in words
     assert "Prewarm hits 90 % 9 of 10 scenes" in words
     assert "Manager overhead 25 %" in words
     assert "lease failed slot_crashed 2 x9 office 01234567" in words
@@ -152,7 +153,7 @@ def test_leases_that_were_given_again_are_told_where_none_failed():
     calm = summary(failures=())
     assert calm.run.stats.redispatched == 2
     page = report_page(calm, EVENTS)
-    assert "No lease failed. 2 rollouts were leased again" in page
+    assert "No lease failed. Rollouts were leased again 2 times, because their workers left" in page
     assert "every lease brought a result" not in page
 
 
@@ -167,4 +168,22 @@ def test_durations_are_formatted_in_fitting_units():
         "12.3 ms",
         "4.2 s",
         "10 min",
+    ]
+    assert [seconds_text(seconds) for seconds in (90.0, 1234.0, 30_000.0, 61_200.0, 432_000.0, 1e9)] == [
+        "90 s",
+        "20.6 min",
+        "8.33 h",
+        "17 h",
+        "5 days",
+        "11,574 days",
+    ]
+
+
+def test_unit_of_a_duration_fits_its_rounded_number():
+    assert [seconds_text(seconds) for seconds in (0.0009999, 0.99996, 119.97, 7199.0, 172_799.0)] == [
+        "1 ms",
+        "1 s",
+        "2 min",
+        "2 h",
+        "2 days",
     ]

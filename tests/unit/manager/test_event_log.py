@@ -4,10 +4,13 @@ from dataclasses import replace
 
 from tests.fakes.worker import completed
 
+from embomatrix.manager.control.cluster_state import ClusterState
 from embomatrix.manager.control.commands import GiveLease
 from embomatrix.manager.control.dispatch.records import LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.manager.observe.event_log import EVENTS_KEPT, LEAST_KEPT, RunEventLog
-from embomatrix.manager.observe.run_archive import ArchivedRun, RunArchive
+from embomatrix.manager.observe.run_archive import ArchivedRun, RunArchive, RunHistory
+from embomatrix.manager.observe.training_reports import TrainingBook
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.wire.leases import LeaseOrigin, LeaseRef, LeaseResult
 from embomatrix.rpc.wire.run_log import EventKind, PhaseSummary, RunSeries, RunSummary
 from embomatrix.rpc.wire.values import (
@@ -142,3 +145,30 @@ def test_archive_keeps_the_latest_runs_and_skips_damaged_files(tmp_path):
     assert archive.load("../runs/r4") is None
     assert archive.load("r4\0") is None
     assert [event.kind for event in archive.load("r4").events] == [EventKind.RUN_OPENED]
+
+
+def test_archive_is_listed_by_several_viewers_and_each_file_read_once(tmp_path, monkeypatch):
+    archive = RunArchive(tmp_path / "runs")
+    for number in range(3):
+        archive.keep(ArchivedRun(summary(f"r{number}"), ()))
+    first = archive.infos()
+    read, files = [], archive._files
+    monkeypatch.setattr(archive, "_message", read.append)
+
+    def interrupted():
+        monkeypatch.setattr(archive, "_files", files)
+        assert archive.infos() == first, "another thread lists the files meanwhile"
+        return files()
+
+    monkeypatch.setattr(archive, "_files", interrupted)
+    assert archive.infos() == first
+    assert read == []
+
+
+async def test_closed_run_is_timed_by_one_clock(tmp_path):
+    log, training = RunEventLog(epoch_s=EPOCH_S), TrainingBook()
+    history = RunHistory(log, RunArchive(tmp_path), ClusterState(lease_key=b"key"), training)
+    history.opened("r1", "a run", PAPER)
+    await history.closed("r1", RunStats(), PhaseSummary())
+    (run,) = await history.kept()
+    assert 0 <= run.closed_s - run.opened_s < 60, "the system's time may be set while a run is open"

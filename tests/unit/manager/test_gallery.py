@@ -1,6 +1,7 @@
 """Dataset pages of the dashboard, and their file access limits."""
 
 import json
+import threading
 import tracemalloc
 from dataclasses import replace
 
@@ -117,6 +118,27 @@ async def test_picture_is_a_jpeg_or_none(folder):
     file.write_bytes(b"\xff\xd8\xff\xe0")
     assert await gallery.picture(digest) == b"\xff\xd8\xff\xe0"
     assert (await gallery.page(**EVERY)).items[0].picture
+
+
+async def test_files_are_looked_at_in_threads_only(folder, monkeypatch):
+    threads = []
+
+    def noted(method):
+        def called(*given, **named):
+            threads.append(threading.get_ident())
+            return method(*given, **named)
+
+        return called
+
+    for name in ("_card", "_file", "_path"):
+        monkeypatch.setattr(Gallery, name, noted(getattr(Gallery, name)))
+    gallery = Gallery(folder)
+    await gallery.page(**EVERY)
+    paged = len(threads)
+    with pytest.raises(NotFoundError):
+        await gallery.picture(digest_of(folder))
+    assert 0 < paged < len(threads)
+    assert threading.get_ident() not in threads
 
 
 async def test_missing_or_damaged_dataset_is_reported(folder, tmp_path):

@@ -21,6 +21,20 @@ def test_heartbeats_of_one_step_are_averaged_and_old_steps_are_dropped():
     assert later.at_s[-1] == (2 * POINTS - 1) * STEP_S
 
 
+def test_silence_leaves_a_gap_and_points_before_the_last_half_hour_are_dropped():
+    book = HostBook()
+    for at_s in (0.0, STEP_S, 20 * STEP_S):
+        beat(book, at_s=at_s)
+    later = book.curve_of("w1")
+    assert later.at_s == [0.0, STEP_S, 2 * STEP_S, 20 * STEP_S]
+    assert later.cpu_share == [0.5, 0.5, None, 0.5]
+    assert later.memory_used_mb == [100, 100, None, 100]
+    beat(book, at_s=(POINTS + 1) * STEP_S)
+    assert book.curve_of("w1").at_s[0] == 2 * STEP_S, "two points are older than half an hour"
+    beat(book, at_s=86_400.0)
+    assert (book.curve_of("w1").at_s, book.curve_of("w1").cpu_share) == ([86_400.0], [0.5])
+
+
 def test_clock_that_is_set_back_begins_a_new_step():
     book = HostBook()
     beat(book, at_s=1000.0)

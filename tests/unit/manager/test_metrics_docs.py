@@ -42,7 +42,8 @@ async def test_documented_metrics_equal_the_exported_ones(page):
 async def test_every_state_and_outcome_has_an_initial_sample(page):
     assert 'embo_slots{state="quarantined"} 0.0' in page
     assert 'embo_rollouts_total{outcome="slot_crashed"} 0.0' in page
-    assert 'embo_hedges_total{won="true"} 0.0' in page
+    assert "embo_hedges_total 0.0" in page
+    assert "embo_hedges_won_total 0.0" in page
 
 
 def test_overhead_covers_the_last_minute():

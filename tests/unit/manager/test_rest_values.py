@@ -44,6 +44,9 @@ def test_health_reports_the_most_important_fact():
     assert mood(workers={"left": 4}) == (Mood.BAD, "3 rollouts are queued and no worker is connected.")
     assert mood(workers={"ready": 1, "left": 9}) == (Mood.GOOD, "All is well.")
     assert mood(workers={"lost": 2, "paused": 1, "left": 1}) == (Mood.BAD, "None of 3 workers is working.")
+    assert mood(workers={"left": 4}, queued=1)[1] == "1 rollout is queued and no worker is connected."
+    assert mood(workers={"lost": 1})[1] == "The only worker is not working."
+    assert mood(leased=0, queued=1)[1] == "1 rollout is queued and none runs: no scene is warm yet."
     assert mood(workers={"ready": 1, "quarantined": 1})[0] is Mood.BAD
     assert mood(workers={"ready": 1, "lost": 1})[1].startswith("1 worker lost recently")
     assert mood(workers={"ready": 1, "lost": 2})[1].endswith("all leases were re-dispatched.")

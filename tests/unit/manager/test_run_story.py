@@ -75,9 +75,21 @@ def test_story_of_an_open_run_without_work_says_what_it_waits_for():
     empty = summary(closed_s=0.0, completed=(), waits_for="no worker is connected")
     assert run_story(empty)[:3] == [
         "The run evening has been open since 2026-09-21 14:13:20 UTC; 3 rollouts wait or run.",
-        "No connected worker can execute its rollouts: no worker is connected.",
+        "No connected worker can execute some of its rollouts: no worker is connected.",
         "No rollout has an outcome.",
     ]
+
+
+def test_long_and_rounded_durations_are_told_in_fitting_units():
+    five_days = summary(closed_s=DAY_S + 5 * 86_400.0)
+    assert run_story(five_days)[0].endswith("for 5 days.")
+    almost_a_second = summary(closed_s=DAY_S + 0.99999)
+    assert run_story(almost_a_second)[0].endswith("for 1 s.")
+
+
+def test_counters_of_leases_are_not_told_as_rollouts():
+    found = run_totals(summary(stats=RunStats(redispatched=7)))
+    assert total(found, "re-dispatches") == 7
 
 
 def test_story_of_training_compares_first_and_last_steps_and_held_out_tasks():

@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
@@ -27,6 +27,7 @@ from embomatrix.host.failure import fail, unwritable
 from embomatrix.host.own_files import PAGE_MARK, Force, keep_foreign, prepare_output
 from embomatrix.host.printable import printable
 from embomatrix.rpc.admin_client import AdminClient
+from embomatrix.rpc.wire.run_log import EventPage, RunEvent
 from embomatrix.world.whole_file import write_whole
 
 T = TypeVar("T")
@@ -89,21 +90,13 @@ async def events(
     as_json: AsJson = False,
 ) -> None:
     """Print the log of a run, or of the workers, one event per line."""
-    console, after = Console(soft_wrap=True, highlight=False), 0
+    console = Console(soft_wrap=True, highlight=False)
     run_id = await client.find_run(run) if run else ""
-    while True:
-        page = await client.read_events(run_id, after=after)
-        for event in page.events:
-            if as_json:
-                show_json(event_plain(event))
-            else:
-                console.print(event_line(event))
-        if page.events:
-            after = page.events[-1].sequence
-        elif follow:
-            await asyncio.sleep(FOLLOW_S)
+    async for event in log_events(lambda after: client.read_events(run_id, after=after), follow=follow):
+        if as_json:
+            show_json(event_plain(event))
         else:
-            return
+            console.print(event_line(event))
 
 
 @app.command()
@@ -214,6 +207,32 @@ async def revoke(
     """Expel a worker: its credential becomes void, and its leases are re-dispatched."""
     await client.revoke_worker(name, reason)
     _done(as_json, worker=name, state="revoked")
+
+
+async def log_events(
+    read: Callable[[int], Awaitable[EventPage]], *, follow: bool, pause_s: float = FOLLOW_S
+) -> AsyncIterator[RunEvent]:
+    """Yield the events of a log, oldest first; with ``follow`` also the coming ones, without end.
+
+    ``read`` returns a page of the events with a higher sequence number. Each page begins with the last known event, if
+    it is the same log: a manager that starts anew numbers its events from 1, so its log is read from its begin.
+    """
+    last: RunEvent | None = None
+    while True:
+        events = (await read(last.sequence - 1 if last is not None else 0)).events
+        if last is not None:
+            if not events or (events[0].sequence, events[0].at_s) != (last.sequence, last.at_s):
+                last = None
+                continue
+            events = events[1:]
+        for event in events:
+            yield event
+        if events:
+            last = events[-1]
+        elif follow:
+            await asyncio.sleep(pause_s)
+        else:
+            return
 
 
 def _list(found: Sequence[T], table: Callable[[Sequence[T]], Table], nothing: str, as_json: bool) -> None:

@@ -10,6 +10,7 @@ from importlib.resources import files
 from typing import Final
 
 from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
+from embomatrix.host.durations import seconds_text
 from embomatrix.pages.head import page_head
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.timeline import busy_share, slot_spans
@@ -45,17 +46,6 @@ def report_page(summary: RunSummary, events: Sequence[RunEvent]) -> str:
         failures=_failures(summary),
         kept=escape(_kept(summary, events)),
     )
-
-
-def seconds_text(seconds: float) -> str:
-    """Format a duration with three digits and a fitting unit."""
-    if seconds >= 120:
-        return f"{seconds / 60:.3g} min"
-    if seconds >= 1:
-        return f"{seconds:.3g} s"
-    if seconds >= 1e-3:
-        return f"{seconds * 1e3:.3g} ms"
-    return f"{seconds * 1e6:.0f} µs" if seconds else "0"
 
 
 def _about(summary: RunSummary) -> str:
@@ -97,7 +87,7 @@ def _tiles(summary: RunSummary) -> str:
         (
             "Completed",
             f"{completed:,}",
-            f"{stats.infra_failures:,} failed, {stats.redispatched:,} rollouts re-dispatched",
+            f"{stats.infra_failures:,} failed, {stats.redispatched:,} re-dispatch{'' if stats.redispatched == 1 else 'es'}",
         ),
         ("Throughput", f"{completed / active_s:,.0f}/s" if active_s else NONE, "while there was work"),
         ("Execute p50", seconds_text(execute.p50_s), f"p99 {seconds_text(execute.p99_s)}"),
@@ -185,11 +175,10 @@ def _failures(summary: RunSummary) -> str:
     if not summary.failures:
         again = summary.run.stats.redispatched
         if again:
-            which = "1 rollout was" if again == 1 else f"{again:,} rollouts were"
-            owner = "its" if again == 1 else "their"
+            times = "1 time" if again == 1 else f"{again:,} times"
             return (
-                f'<p class="none">No lease failed. {which} leased again because {owner} worker left, drained or '
-                "fell silent before it had a result.</p>"
+                f'<p class="none">No lease failed. Rollouts were leased again {times}, because their workers left, drained '
+                "or fell silent before they had a result.</p>"
             )
         return '<p class="none">None: every lease brought a result.</p>'
     codes = Counter(event.code for event in summary.failures)

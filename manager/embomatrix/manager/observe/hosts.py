@@ -1,5 +1,6 @@
 """Workers' machines in bounded memory: use of CPU and memory over time, and the latest lines of each worker's log."""
 
+import math
 from array import array
 from collections import OrderedDict, deque
 from collections.abc import Sequence
@@ -13,7 +14,9 @@ from embomatrix.rpc.wire.values import HostUse
 STEP_S: Final = 10.0
 """Heartbeats within this time share one point, their mean."""
 POINTS: Final = 180
-"""Points of one machine: half an hour."""
+"""Points of one machine at most: half an hour. Older ones are dropped, also after a pause."""
+GAP_S: Final = 6 * STEP_S
+"""Time without a heartbeat from which the curve has a gap."""
 LINES: Final = 50
 """Log lines of one worker at most."""
 HOSTS_KEPT: Final = 20_000
@@ -23,11 +26,14 @@ ALL_LINES: Final = 100_000
 
 @dataclass(frozen=True, slots=True)
 class HostCurve:
-    """Use of a machine over time, oldest first. ``at_s`` is the begin of each step, in seconds since the epoch."""
+    """Use of a machine over time, oldest first. ``at_s`` is the begin of each step, in seconds since the epoch.
+
+    A step of None stands for a time in which the worker was silent.
+    """
 
     at_s: list[float]
-    cpu_share: list[float]
-    memory_used_mb: list[int]
+    cpu_share: list[float | None]
+    memory_used_mb: list[int | None]
     memory_mb: int
     """Memory of the machine; 0 if the worker does not report it."""
 
@@ -91,8 +97,8 @@ class HostBook:
         host = self._hosts.get(worker_id) or _Host()
         return HostCurve(
             list(host.at_s),
-            [round(share, 4) for share in host.cpu_share],
-            [round(used) for used in host.memory_mb],
+            [None if math.isnan(share) else round(share, 4) for share in host.cpu_share],
+            [None if math.isnan(used) else round(used) for used in host.memory_mb],
             host.use.memory_mb if host.use is not None else 0,
         )
 
@@ -121,10 +127,16 @@ def _add(host: _Host, use: HostUse, at_s: float) -> None:
         host.memory_mb[-1] += (use.memory_used_mb - host.memory_mb[-1]) / host.beats
         return
     host.beats = 1
-    for column, value in (
-        (host.at_s, at_s),
-        (host.cpu_share, use.cpu_share),
-        (host.memory_mb, use.memory_used_mb),
-    ):
-        column.append(value)
-        del column[:-POINTS]
+    if host.at_s and at_s - host.at_s[-1] > GAP_S:
+        _append(host, host.at_s[-1] + STEP_S, math.nan, math.nan)
+    _append(host, at_s, use.cpu_share, use.memory_used_mb)
+    old = next(place for place, begin_s in enumerate(host.at_s) if at_s - begin_s < POINTS * STEP_S)
+    old = max(old, len(host.at_s) - POINTS)
+    for column in (host.at_s, host.cpu_share, host.memory_mb):
+        del column[:old]
+
+
+def _append(host: _Host, at_s: float, cpu_share: float, memory_mb: float) -> None:
+    host.at_s.append(at_s)
+    host.cpu_share.append(cpu_share)
+    host.memory_mb.append(memory_mb)

@@ -72,12 +72,15 @@ class RunHistory:
 
     async def closed(self, run_id: str, stats: RunStats, leads: PhaseSummary) -> None:
         """Move a closed run, with its final counters, to the archive."""
-        record = self._event_log.close_run(run_id, now_s=time.monotonic())
+        now_s = time.monotonic()
+        record = self._event_log.close_run(run_id, now_s=now_s)
         logger.info(
             "run closed run=%s: %d outcomes, %d failures", run_id, stats.delivered, stats.infra_failures
         )
         if record is not None:
-            info = self._info(record, stats, pending=0, closed_s=time.time())
+            # On the clock of the opening, which a change of the system's time does not move.
+            closed_s = self._event_log.epoch_s + now_s
+            info = self._info(record, stats, pending=0, closed_s=closed_s)
             summary = self._summed(record, info, leads)
             kept = ArchivedRun(summary, tuple(record.ring.events), self._training.copy_of(run_id))
             await asyncio.to_thread(self._archive.keep, kept)
@@ -242,7 +245,7 @@ class RunArchive:
 
     def infos(self) -> list[RunInfo]:
         """Return the listings of the archived runs, the last closed first."""
-        known, self._infos = self._infos, {}
+        known, seen = self._infos, dict[str, tuple[int, RunInfo | None]]()
         found: list[RunInfo] = []
         for path in self._files():
             try:
@@ -253,9 +256,11 @@ class RunArchive:
             if entry is None or entry[0] != changed_ns:
                 message = self._message(path)
                 entry = (changed_ns, None if message is None else self._info(path, message))
-            self._infos[path.name] = entry
+            seen[path.name] = entry
             if entry[1] is not None:
                 found.append(entry[1])
+        # Other threads list the files at the same time: they find the former listings until the new ones are whole.
+        self._infos = seen
         return found
 
     def load(self, run_id: str) -> ArchivedRun | None:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Final
 
+from embomatrix.host.durations import seconds_text
 from embomatrix.manager.observe.run_totals import ENDS, working_s
 from embomatrix.manager.observe.training_reports import Curves, TrainingDetail
 from embomatrix.rpc.wire.run_log import EventKind, RolloutPhase, RunSummary
@@ -34,12 +35,12 @@ def _time(summary: RunSummary) -> Iterator[str]:
     if run.closed_s:
         yield (
             f"{name} was open from {_clock(run.opened_s)} to {_clock(run.closed_s)}, "
-            f"for {_seconds(run.closed_s - run.opened_s)}."
+            f"for {seconds_text(run.closed_s - run.opened_s)}."
         )
     else:
-        yield f"{name} has been open since {_clock(run.opened_s)}; {_counted(run.pending, 'rollout')} wait or run."
+        yield f"{name} has been open since {_clock(run.opened_s)}; {_pending(run.pending)}."
     if run.waits_for:
-        yield f"No connected worker can execute its rollouts: {run.waits_for}."
+        yield f"No connected worker can execute some of its rollouts: {run.waits_for}."
 
 
 def _outcomes(summary: RunSummary) -> Iterator[str]:
@@ -75,8 +76,8 @@ def _speed(summary: RunSummary) -> Iterator[str]:
     completed, busy_s = sum(summary.series.completed), working_s(summary)
     execute = summary.phases.get(RolloutPhase.EXECUTE)
     if completed and busy_s:
-        median = f" Half of them executed within {_seconds(execute.p50_s)}" if execute else ""
-        slowest = f", 99 % within {_seconds(execute.p99_s)}." if execute else ""
+        median = f" Half of them executed within {seconds_text(execute.p50_s)}" if execute else ""
+        slowest = f", 99 % within {seconds_text(execute.p99_s)}." if execute else ""
         yield (
             f"While there was work, {completed / busy_s:,.1f} rollouts were completed per second.{median}{slowest}"
         )
@@ -132,17 +133,13 @@ def _ends(curves: Curves) -> Iterator[str]:
             yield f"{words} was {first:{style}} in the first {where} and {last:{style}} in the last."
 
 
+def _pending(count: int) -> str:
+    return "1 rollout waits or runs" if count == 1 else f"{count:,} rollouts wait or run"
+
+
 def _clock(at_s: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(at_s))
 
 
 def _counted(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
-def _seconds(seconds: float) -> str:
-    """Return the duration with three digits and a fitting unit."""
-    for least_s, unit, name in ((7200, 3600, "h"), (120, 60, "min"), (1, 1, "s")):
-        if seconds >= least_s:
-            return f"{seconds / unit:.3g} {name}"
-    return f"{seconds * 1000:.3g} ms"

@@ -64,7 +64,7 @@ def _work(summary: RunSummary) -> Iterator[RunTotal]:
     yield RunTotal("length", length_s(summary), TotalUnit.SECONDS)
     yield RunTotal("completed rollouts", completed, TotalUnit.COUNT)
     yield RunTotal("infrastructure failures", stats.infra_failures, TotalUnit.COUNT, Aim.DOWN)
-    yield RunTotal("re-dispatched rollouts", stats.redispatched, TotalUnit.COUNT, Aim.DOWN)
+    yield RunTotal("re-dispatches", stats.redispatched, TotalUnit.COUNT, Aim.DOWN)
     yield RunTotal("throughput while there was work", rate, TotalUnit.RATE, Aim.UP)
     yield RunTotal("workers", sum(worker.completed > 0 for worker in summary.workers), TotalUnit.COUNT)
 

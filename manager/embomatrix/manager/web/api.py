@@ -21,6 +21,7 @@ from embomatrix.manager.web.http_rules import STATIC, Guard, HttpRules
 from embomatrix.manager.web.prometheus import CONTENT_TYPE, metrics_page
 from embomatrix.manager.web.rest import (
     PREFIX,
+    REFUSALS,
     answer_errors,
     command_routes,
     only_known_parameters,
@@ -87,7 +88,7 @@ def build_api(
         command_routes(runtime, snapshots, revocation),
         reward_routes(runtime.runs),
     ):
-        app.include_router(routes, dependencies=strictly)
+        app.include_router(routes, dependencies=strictly, responses=REFUSALS)
 
     @app.get("/", include_in_schema=False)
     async def index() -> FileResponse:

@@ -126,7 +126,7 @@ class WorkerView:
     labels: dict[str, str] = field(default_factory=dict)
     """Labels of the owner, sorted by name."""
     host: HostUse | None = None
-    """Use of its machine by all programs; None if it does not report it."""
+    """Use of its machine by all programs now; None if it does not report it, is lost or has left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +339,7 @@ def worker_view(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
         residents=list(residents),
         loads=[scene for scene in scheduler.desired(worker_id) if scene not in here],
         labels=dict(sorted(session.resources.labels.items())),
-        host=runtime.hosts.use_of(worker_id),
+        host=None if session.standing.is_gone else runtime.hosts.use_of(worker_id),
     )
 
 
@@ -354,10 +354,13 @@ def health(seen: Overview, *, paused: bool, now_s: float) -> Health:
     every = sum(seen.workers.values()) - seen.workers.get("left", 0)
     if not every:
         if seen.queued:
-            return Health(Mood.BAD, f"{seen.queued} rollouts are queued and no worker is connected.")
+            return Health(Mood.BAD, f"{_queued(seen.queued)} and no worker is connected.")
         return Health(Mood.IDLE, "Every worker has left." if seen.workers else "No worker has joined yet.")
     if not working:
-        return Health(Mood.BAD, f"None of {every} workers is working.")
+        return Health(
+            Mood.BAD,
+            "The only worker is not working." if every == 1 else f"None of {every} workers is working.",
+        )
     if quarantined := seen.workers.get("quarantined", 0):
         return Health(
             Mood.BAD, f"{_workers(quarantined)} in quarantine: results disagreed with other workers."
@@ -388,7 +391,7 @@ def _health_of_work(seen: Overview, working: int, lost: int, now_s: float) -> He
     if lost:
         return Health(Mood.WARNING, f"{_workers(lost)} lost recently; all leases were re-dispatched.")
     if seen.queued and not seen.leased:
-        return Health(Mood.WARNING, f"{seen.queued} rollouts are queued and none runs: no scene is warm yet.")
+        return Health(Mood.WARNING, f"{_queued(seen.queued)} and none runs: no scene is warm yet.")
     if seen.core_share > BUSY_CORE:
         return Health(
             Mood.WARNING,
@@ -398,6 +401,10 @@ def _health_of_work(seen: Overview, working: int, lost: int, now_s: float) -> He
         waits = "waits" if working == 1 else "wait"
         return Health(Mood.IDLE, f"Ready: {_workers(working)} {waits} for a run.")
     return Health(Mood.GOOD, "All is well.")
+
+
+def _queued(count: int) -> str:
+    return "1 rollout is queued" if count == 1 else f"{count} rollouts are queued"
 
 
 def _workers(count: int) -> str:

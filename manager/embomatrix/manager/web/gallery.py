@@ -6,6 +6,7 @@ limited.
 
 import asyncio
 import functools
+import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -65,6 +66,8 @@ class Gallery:
         self._reading = asyncio.Lock()
         self._stamp: tuple[int, int] | None = None
         self._records: dict[str, TaskRecord] = {}
+        self._scenes: dict[str, str] = {}
+        """Scene of each bundle, in the order of the tasks."""
         self._dataset: Dataset  # set with the stamp
         self._held: tuple[str, Scene] | None = None
         """Scene that was read last, by its digest. A hostile one takes 100 MB, so there is only one."""
@@ -74,7 +77,11 @@ class Gallery:
         """Return a page of the tasks with these words in their instruction or id, in file order. Raises
         UnavailableError.
         """
-        records = list((await self._loaded()).values())
+        async with self._reading:
+            return await asyncio.to_thread(self._page, search, scene, category, offset, limit)
+
+    def _page(self, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
+        records = list(self._load().values())
         words = search.lower().split()
         found = [
             record
@@ -95,9 +102,8 @@ class Gallery:
 
     async def scenes(self, *, offset: int, limit: int) -> list[SceneName]:
         """Return the scene of each bundle, in the order of the tasks. Raises UnavailableError."""
-        records = (await self._loaded()).values()
-        names = {record.bundle_digest: record.task.scene_id for record in records}
-        return [SceneName(digest, name) for digest, name in names.items()][offset : offset + limit]
+        await self._loaded()
+        return [SceneName(*pair) for pair in itertools.islice(self._scenes.items(), offset, offset + limit)]
 
     async def detail(self, task_id: str, steps: Sequence[SampledStep] | None = None) -> TaskDetail:
         """Return one task, with the moments of the steps if they are given, else with those of the oracle's plan.
@@ -119,7 +125,9 @@ class Gallery:
     async def picture(self, digest: str) -> bytes:
         """Return the JPEG of a bundle's scene that ``embomatrix factory pictures`` made. Raises NotFoundError."""
         await self._check_bundle(digest)
-        data = self._file(PICTURES_FOLDER, f"{digest.removeprefix('sha256:')}.jpg", PICTURE_BYTES)
+        name = f"{digest.removeprefix('sha256:')}.jpg"
+        async with self._reading:
+            data = await asyncio.to_thread(self._file, PICTURES_FOLDER, name, PICTURE_BYTES)
         if not data.startswith(_JPEG):
             raise NotFoundError(
                 f"there is no picture of scene {digest}: `embomatrix factory pictures` makes them"
@@ -127,7 +135,8 @@ class Gallery:
         return data
 
     async def _check_bundle(self, digest: str) -> None:
-        if not any(record.bundle_digest == digest for record in (await self._loaded()).values()):
+        await self._loaded()
+        if digest not in self._scenes:
             raise NotFoundError(f"no task of the dataset is in a bundle {digest[:80]!r}")
 
     async def _loaded(self) -> dict[str, TaskRecord]:
@@ -147,11 +156,12 @@ class Gallery:
                 dataset = Dataset.load(self._folder)
                 self._dataset, self._stamp = dataset, (known.st_mtime_ns, known.st_size)
                 self._records = {record.task.task_id: record for record in dataset.records}
+                self._scenes = {record.bundle_digest: record.task.scene_id for record in dataset.records}
                 self._held = None
                 self._floor.cache_clear()
         except OSError as error:
             if isinstance(error, FileNotFoundError) and self._folder.is_dir():
-                self._stamp, self._records = None, {}
+                self._stamp, self._records, self._scenes = None, {}, {}
                 return self._records
             raise UnavailableError(
                 f"the dataset {self._folder} can't be read ({error.strerror}): start the manager with another --dataset"

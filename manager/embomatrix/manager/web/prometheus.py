@@ -76,9 +76,8 @@ class _Cluster(Collector):
         yield _counter("embo_redispatched", "Re-dispatched leases.", totals.redispatched)
         yield _counter("embo_lease_expired", "Expired leases.", dispatcher.state.leases.expired)
         yield _counter("embo_stale_results", "Late results that were rejected.", totals.stale_results)
-        won = event_log.hedges_won
-        hedges = {"true": won, "false": max(0, totals.hedged - won)}
-        yield _counter("embo_hedges", "Hedge leases, by whether they delivered first.", hedges, "won")
+        yield _counter("embo_hedges", "Hedge leases.", totals.hedged)
+        yield _counter("embo_hedges_won", "Hedge leases that delivered first.", event_log.hedges_won)
         shared = {"shared": totals.shared_steps, "executed": totals.steps - totals.shared_steps}
         yield _counter(
             "embo_steps", "Steps of completed rollouts, by whether they were executed.", shared, "how"

@@ -9,21 +9,25 @@ import dataclasses
 import functools
 import json
 from collections.abc import AsyncIterator, Iterator, Mapping
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, cast
 
 from fastapi import APIRouter, Body, FastAPI, HTTPException, Path, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, StreamingResponse
+from pydantic import BeforeValidator
 
 from embomatrix.manager.access.gate import Gate, the_token
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
+from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.manager.runtime.revocation import Revocation
-from embomatrix.manager.web.cluster_view import LookaheadStep, Overview, Snapshots
+from embomatrix.manager.web.cluster_view import LookaheadStep, Overview, Snapshots, worker_view
 from embomatrix.manager.web.rest_values import (
     LARGEST_PAGE,
     PAGE,
     CallerView,
     Changed,
     EventList,
+    Refusal,
     SnapshotPage,
     event_fields,
     snapshot_page,
@@ -36,6 +40,7 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
+from embomatrix.rpc.wire.run_log import EventKind
 from embomatrix.rpc.wire.tokens import AccessRole
 
 PREFIX: Final = "/api/v1"
@@ -53,12 +58,29 @@ LOOK_S: Final = 0.5
 SILENCE_S: Final = 15.0
 """An idle stream sends a comment this often, so that proxies keep the connection open."""
 
+SEARCH_CHARS: Final = 128
+"""Longest text of a search, as long as the longest name of a worker and id of a run."""
+FOUND_CHARS: Final = 64
+"""Characters of an invalid value that its refusal repeats."""
+REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
+    422: {"model": Refusal, "description": "Invalid parameter or body."}
+}
+"""Description of ``answer_errors`` for the OpenAPI page."""
+
 Offset = Annotated[int, Query(ge=0, description="Rows to skip.")]
 Limit = Annotated[int, Query(ge=1, le=LARGEST_PAGE, description="Maximum number of rows.")]
-State = Annotated[str, Query(max_length=32, description="Only workers in this state.", examples=["ready"])]
+State = Annotated[
+    WorkerStanding | None,
+    # Forms send an empty value for every state.
+    BeforeValidator(lambda text: text or None),
+    Query(description="Only workers in this state.", examples=["ready"]),
+]
 Search = Annotated[
     str,
-    Query(max_length=64, description="Only workers with this text in their name; in lists, also in a label."),
+    Query(
+        max_length=SEARCH_CHARS,
+        description="Only workers with this text in their name; in lists, also in a label.",
+    ),
 ]
 Run = Annotated[str, Query(max_length=256, description="Run id; empty for the log of workers and scenes.")]
 After = Annotated[int, Query(ge=0, description="Only events with a higher sequence number.")]
@@ -86,12 +108,13 @@ def read_routes(runtime: ManagerRuntime, snapshots: Snapshots, gate: Gate) -> AP
 
     @router.get("/snapshot", response_model=SnapshotPage, summary="State of the whole cluster at one moment")
     async def snapshot(
-        state: State = "", search: Search = "", offset: Offset = 0, limit: Limit = PAGE
+        state: State = None, search: Search = "", offset: Offset = 0, limit: Limit = PAGE
     ) -> Response:
         """All data of the dashboard's lists: health, figures, a page of workers, runs, look-ahead, training."""
         key = (state, search, offset, limit)
         text = snapshots.page(
-            key, lambda seen: snapshot_page(seen, state=state, search=search, offset=offset, limit=limit)
+            key,
+            lambda seen: snapshot_page(seen, state=state or "", search=search, offset=offset, limit=limit),
         )
         return Response(text, media_type="application/json")
 
@@ -117,14 +140,14 @@ def command_routes(runtime: ManagerRuntime, snapshots: Snapshots, revocation: Re
         """Let a worker finish its leases, and give it no new ones."""
         with _changing(snapshots):
             runtime.drain_worker(worker_id)
-        return Changed(worker_id, "draining")
+        return _standing(runtime, worker_id)
 
     @router.post("/workers/{worker_id}/resume", response_model=Changed, summary="Resume a worker")
     async def resume(worker_id: Worker) -> Changed:
         """Cancel the drain, or lift the quarantine, of a worker that has not left."""
         with _changing(snapshots):
             runtime.resume_worker(worker_id)
-        return Changed(worker_id, "ready")
+        return _standing(runtime, worker_id)
 
     @router.post("/workers/{worker_id}/revoke", response_model=Changed, summary="Expel a worker")
     async def revoke(worker_id: Worker, reason: Reason) -> Changed:
@@ -148,6 +171,11 @@ def command_routes(runtime: ManagerRuntime, snapshots: Snapshots, revocation: Re
         return Changed("dispatch", "running")
 
     return router
+
+
+def _standing(runtime: ManagerRuntime, worker_id: str) -> Changed:
+    """Return the state of a worker after a command, as lists show it: a quarantine hides a drain."""
+    return Changed(worker_id, worker_view(runtime, worker_id).state)
 
 
 def _figures(router: APIRouter, snapshots: Snapshots) -> None:
@@ -196,16 +224,20 @@ def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:
 
 
 async def _growing(runtime: ManagerRuntime, run: str, after: int) -> AsyncIterator[str]:
-    """Yield events as they arrive, until the run's log is gone."""
+    """Yield events as they arrive, until the run is closed and all its events are sent."""
     silent_s = 0.0
     while True:
         try:
             page = await runtime.history.events(run, after, 0)
         except NotFoundError:
             return
+        if not page.events and run and run not in runtime.event_log.runs:
+            return
         for event in page.events:
             after = event.sequence
             yield f"id: {after}\ndata: {json.dumps(event_fields(event))}\n\n"
+        if page.events and page.events[-1].kind is EventKind.RUN_CLOSED:
+            return
         silent_s = 0.0 if page.events else silent_s + LOOK_S
         if silent_s >= SILENCE_S:
             silent_s = 0.0
@@ -220,13 +252,30 @@ def json_response(value: object) -> Response:
 
 
 def answer_errors(app: FastAPI) -> None:
-    """Answer each ClusterError of a route with an HTTP error and the same message."""
+    """Answer each ClusterError of a route, and each invalid parameter, with an HTTP error and a message."""
     for kind, status in STATUSES.items():
         app.add_exception_handler(kind, functools.partial(_problem, status))
+    app.add_exception_handler(RequestValidationError, _invalid)
 
 
 async def _problem(status: int, _: Request, error: Exception) -> Response:
     return JSONResponse({"detail": str(error)}, status)
+
+
+async def _invalid(_: Request, error: Exception) -> Response:
+    """Answer invalid parameters with one sentence that names each."""
+    found = cast("RequestValidationError", error).errors()
+    return JSONResponse({"detail": "; ".join(map(_refusal, found))}, 422)
+
+
+def _refusal(problem: Mapping[str, Any]) -> str:
+    place, *path = map(str, problem["loc"])
+    words = problem["msg"]
+    if words[1:2].islower():
+        words = words[0].lower() + words[1:]
+    if problem["type"] not in ("missing", "json_invalid"):
+        words += f", found {str(problem['input'])[:FOUND_CHARS]!r}"
+    return f"{place} {'.'.join(path)}: {words}" if path else f"{place}: {words}"
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from embomatrix.manager.observe.training_reports import TrainingDetail, Training
 from embomatrix.manager.runtime.event_loop import ManagerRuntime
 from embomatrix.manager.web.cluster_view import Snapshots
 from embomatrix.manager.web.gallery_values import SampledPlanView
-from embomatrix.manager.web.rest import PREFIX, Limit, Offset, Search, json_response
+from embomatrix.manager.web.rest import PREFIX, SEARCH_CHARS, Limit, Offset, Search, json_response
 from embomatrix.manager.web.rest_tasks import NO_DATASET
 from embomatrix.manager.web.rest_values import (
     PAGE,
@@ -36,7 +36,9 @@ RunId = Annotated[
 Shown = Annotated[
     RunFilter, Query(alias="state", description="Open runs, closed runs that are kept, or all.")
 ]
-Words = Annotated[str, Query(max_length=64, description="Only runs with this text in their name or id.")]
+Words = Annotated[
+    str, Query(max_length=SEARCH_CHARS, description="Only runs with this text in their name or id.")
+]
 Seconds = Annotated[float, Query(gt=0, le=LONGEST_S, description="Length of the interval, in seconds.")]
 
 

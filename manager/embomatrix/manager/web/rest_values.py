@@ -203,6 +203,13 @@ class Changed:
     state: str
 
 
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Reason in one sentence why a request was refused."""
+
+    detail: str
+
+
 def worker_page(
     seen: Snapshot, *, state: str = "", search: str = "", offset: int = 0, limit: int = PAGE
 ) -> WorkerPage:

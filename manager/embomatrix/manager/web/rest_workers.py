@@ -18,10 +18,10 @@ def worker_routes(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
 
     @router.get("/workers", response_model=WorkerPage, summary="Workers by state, name or label")
     async def workers(
-        state: State = "", search: Search = "", offset: Offset = 0, limit: Limit = PAGE
+        state: State = None, search: Search = "", offset: Offset = 0, limit: Limit = PAGE
     ) -> Response:
         """Page of workers, those that need attention first."""
-        page = worker_page(snapshots.now(), state=state, search=search, offset=offset, limit=limit)
+        page = worker_page(snapshots.now(), state=state or "", search=search, offset=offset, limit=limit)
         return json_response(page)
 
     @router.get("/workers/{worker_id}", response_model=WorkerDetail, summary="One worker and its machine")

@@ -1,5 +1,5 @@
 // Dashboard: one snapshot a second feeds the page that is open.
-import {ask} from "./ask.js";
+import {Refused, Unanswered, ask} from "./ask.js";
 import {at, clock, h, seconds} from "./dom.js";
 import {learn} from "./names.js";
 
@@ -49,9 +49,9 @@ async function open() {
   setTimeout(() => Promise.allSettled([...Object.values(PAGES), ...PARTS].map(load => load())), REFRESH_MS);
 }
 
-function lost() {
+function lost(what = "failed to load") {
   at("dot").className = "dot lost";
-  showStatus("a part of the dashboard failed to load: reload the page");
+  showStatus(`a part of the dashboard ${what}: reload the page`);
 }
 
 /** Page for a name that is none. */
@@ -64,8 +64,11 @@ function unknown(name) {
 async function refresh(first = null) {
   clearTimeout(waiting);
   if (!page) return;
+  const asked = page, turn = opened;
+  let seen = false;
   try {
-    const asked = page, snapshot = await (first ?? ask(`snapshot?${new URLSearchParams(asked.query?.() ?? {limit: 1})}`));
+    const snapshot = await (first ?? ask(`snapshot?${new URLSearchParams(asked.query?.() ?? {limit: 1})}`));
+    seen = true;
     if (asked === page) {
       showOverview(snapshot);
       await page.show(snapshot);
@@ -74,13 +77,27 @@ async function refresh(first = null) {
       learn(); // scene names must not delay the first view
     }
   } catch (error) {
-    at("dot").className = "dot lost";
-    showStatus(error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; retrying" : error.message);
-    age();
+    if (turn !== opened) return; // the page that failed is closed, and the next one refreshes itself
+    complain(error, seen);
   }
   clearTimeout(waiting);
   // A hidden page refreshes rarely.
   waiting = setTimeout(refresh, document.hidden ? 10 * REFRESH_MS : REFRESH_MS);
+}
+
+/** Tell the viewer why the page is not up to date. The lists of an answered snapshot are. */
+function complain(error, seen) {
+  at("dot").className = "dot lost";
+  if (error instanceof Unanswered) {
+    showStatus(`${error.message}; retrying`);
+    age("the manager has not answered since");
+  } else if (error instanceof Refused) {
+    showStatus(error.message);
+    if (!seen) age(error.message);
+  } else {
+    lost("failed");
+    console.error(error);
+  }
 }
 
 /** Screen readers announce changed text. The uptime changes every second and is kept out of it. */
@@ -89,12 +106,12 @@ function showStatus(words, up = "") {
   if (at("states").textContent !== words) at("states").textContent = words;
 }
 
-/** Mark the page as outdated, with the time of its data. */
-function age() {
+/** Mark the page as outdated, with the time of its data and the reason. */
+function age(why) {
   if (!shown_s) return;
   at("main").classList.add("old");
   at("health").className = "health bad";
-  const words = `This page shows the state of ${clock(shown_s)}: the manager has not answered since.`;
+  const words = `This page shows the state of ${clock(shown_s)}: ${why}.`;
   if (at("health").textContent !== words) at("health").textContent = words;
 }
 

@@ -22,11 +22,11 @@ function latest(drawn) {
 }
 
 /** A chart in an element. `lines` are the names of the series; `words` formats the ticks of the x axis, `across` names it and `steps` are its intervals; `most` is the
- * end of the y axis; `fill` fills a single line. */
-export function chart(place, lines, {high = 190, words, across = "step", steps = words ? TIMES : WHOLE, most: end, fill = false, legend = true} = {}) {
+ * end of the y axis; `fill` fills a single line; `joined` lines cross steps without a value. */
+export function chart(place, lines, {high = 190, words, across = "step", steps = words ? TIMES : WHOLE, most: end, fill = false, legend = true, joined = true} = {}) {
   const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
   const series = lines.map((label, i) => ({
-    label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], spanGaps: true,
+    label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], spanGaps: joined,
     // A single value is shown as a point.
     points: {show: (drawn, number) => drawn.data[number].filter(value => value !== null && value !== undefined).length === 1, size: 6},
     stroke: () => colour(TINTS[i % TINTS.length]), ...(fill ? {fill: () => `${colour(TINTS[i])}22`} : {}),

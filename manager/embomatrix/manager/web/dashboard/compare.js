@@ -7,8 +7,11 @@ import {savePage} from "./save.js";
 
 const CURVES = [["reward", "Reward per step"], ["success", "Success per step"]];
 let ids = [], drawn = [], details = null;
+/** Raised when the page is opened or closed: answers to an earlier page are not shown. */
+let turn = 0;
 
 export function open(main, ...both) {
+  turn += 1;
   ids = both.slice(0, 2); drawn = []; details = null;
   main.replaceChildren(
     h("section", {}, h("h2", {}, h("a", {href: "#runs", class: "back"}, "All runs"), h("small", {}, ids.join(", "))), h("p", {class: "instruction", id: "title"}, "Loading the runs…"),
@@ -20,6 +23,7 @@ export function open(main, ...both) {
 }
 
 export function close() {
+  turn += 1;
   for (const one of drawn) one.close();
   drawn = [];
 }
@@ -27,15 +31,16 @@ export function close() {
 /** Runs are compared as they were when the page was opened. */
 export async function show() {
   if (details) return;
+  const mine = turn, paths = ids.map(encodeURIComponent);
   try {
-    const found = await Promise.all(ids.map(id => ask(`runs/${encodeURIComponent(id)}`)));
-    const trained = await Promise.all(found.map((one, i) => one.trained ? ask(`training/${encodeURIComponent(ids[i])}`) : null));
-    if (!at("story1")) return;
+    const found = await Promise.all(paths.map(path => ask(`runs/${path}`)));
+    const trained = await Promise.all(found.map((one, i) => one.trained ? ask(`training/${paths[i]}`) : null));
+    if (mine !== turn || details) return;
     details = found;
     draw(trained);
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    if (at("title")) at("title").textContent = error.message;
+    if (mine === turn) at("title").textContent = error.message;
   }
 }
 

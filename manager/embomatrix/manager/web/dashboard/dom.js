@@ -26,6 +26,8 @@ export const count = number => Number(number).toLocaleString("en");
 /** Number and unit with a no-break space. */
 const unit = (number, of) => `${number}\u00a0${of}`;
 export const share = (part, all) => all ? unit(Math.round(100 * part / all), "%") : "–";
+/** Offset of the last page of a list. */
+export const lastPage = (total, rows) => Math.max(0, Math.ceil(total / rows) - 1) * rows;
 export const counted = (number, noun) => `${count(number)} ${noun}${number === 1 ? "" : "s"}`;
 /** Time of day; with the date unless it is today. */
 export function clock(seconds) {
@@ -48,12 +50,13 @@ export const splitWords = split => split === "heldout" ? "held out" : split;
 export const none = text => h("div", {class: "none"}, text);
 export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
+/** Duration. The bounds are of the rounded number, so that it is never 1000 ms or 120 s. */
 export function seconds(s) {
   if (s === 0) return "–";
-  if (s < 1) return unit((s * 1000).toFixed(s < 0.01 ? 1 : 0), "ms");
-  if (s < 120) return unit(s.toFixed(s < 10 ? 1 : 0), "s");
-  if (s < 7200) return unit(Math.round(s / 60), "min");
-  return s < 172800 ? unit((s / 3600).toFixed(1), "h") : unit(Math.round(s / 86400), "days");
+  if (s < 0.9995) return unit((s * 1000).toFixed(s < 0.00995 ? 1 : 0), "ms");
+  if (s < 119.5) return unit(s.toFixed(s < 9.95 ? 1 : 0), "s");
+  if (s < 7170) return unit(Math.round(s / 60), "min");
+  return s < 172_620 ? unit((s / 3600).toFixed(1), "h") : unit(Math.round(s / 86400), "days");
 }
 
 /** Fill level. */

@@ -8,10 +8,18 @@ const BAD = ["failed", "worker_lost", "scene_failed"];
 const KEPT = 200;
 const ROWS = 50;
 const LOOK_EVERY = 3;
+/** Two starts of a manager are further apart than the clocks of one drift between two snapshots. */
+const ONE_START_S = 1;
 let log = [], after = 0, looks = 0, lost = [];
+/** Start of the manager whose log is shown, in seconds since the epoch. */
+let began_s = 0;
+/** Raised when the page is opened or closed: answers to an earlier page are not shown. */
+let turn = 0;
 
 export function open(main) {
-  log = []; after = 0; looks = 0; lost = [];
+  turn += 1;
+  began_s = 0;
+  forget();
   main.replaceChildren(
     h("section", {}, h("h2", {}, "Since the manager started"), h("p", {id: "sum"})),
     h("section", {class: "half"}, h("h2", {}, "By reason ", h("small", {}, "all failed rollouts, and the attempts below")), h("div", {id: "reasons"})),
@@ -20,11 +28,27 @@ export function open(main) {
     h("section", {}, h("h2", {}, "Failed attempts ", h("small", {}, "latest failed leases of open runs, failed scenes and lost workers: their rollouts were re-dispatched")), h("div", {id: "attempts"})));
 }
 
-export async function show({overview, runs}) {
-  const given = overview.failures;
-  if (looks++ % LOOK_EVERY === 0) lost = await look(runs);
+export function close() {
+  turn += 1;
+}
+
+function forget() {
+  log = []; after = 0; looks = 0; lost = [];
+}
+
+export async function show({at_s, overview, runs}) {
+  const given = overview.failures, mine = turn, start_s = at_s - overview.uptime_s;
+  // Another manager numbers its events from 1 again.
+  if (Math.abs(start_s - began_s) > ONE_START_S) forget();
+  began_s = start_s;
+  if (looks % LOOK_EVERY) {
+    looks += 1;
+  } else {
+    await look(runs, mine);
+    if (mine !== turn) return;
+  }
   const ended = Object.entries(overview.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled"), attempts = lost.map(event => [event.code || event.kind, 1]);
-  put(at("sum"), `${counted(overview.failed, "rollout")} ended in an infrastructure failure, which is never scored as a reward. ${counted(overview.redispatched, "rollout")} ${overview.redispatched === 1 ? "was" : "were"} re-dispatched after a lease that failed or expired.`);
+  put(at("sum"), `${counted(overview.failed, "rollout")} ended in an infrastructure failure, which is never scored as a reward. Rollouts were leased again ${counted(overview.redispatched, "time")}, after a lease that failed or expired.`);
   put(at("reasons"), tally("reason", ended, attempts));
   put(at("blamed"), tally("worker", given.map(note => [note.worker_id || "none", note.count]), lost.map(event => [event.worker_id || "none", 1])));
   const listed = given.reduce((sum, note) => sum + note.count, 0);
@@ -39,13 +63,15 @@ export async function show({overview, runs}) {
     every.length > ROWS ? none(`${count(every.length - ROWS)} more of the latest ${count(KEPT)}; list all with: embomatrix cluster events`) : "");
 }
 
-/** The latest events of the cluster and of the latest runs, newest first. */
-async function look(runs) {
-  const pages = [await ask(`events?after=${after}`), ...await Promise.all(runs.slice(-3).map(run => ask(`runs/${encodeURIComponent(run.run_id)}`).then(summary => ({events: summary.failures.filter(event => event.kind === "failed")}))))];
+/** Find the latest events of the cluster and of the latest runs, newest first. */
+async function look(runs, mine) {
+  const from = after, pages = [await ask(`events?after=${from}`), ...await Promise.all(runs.slice(-3).map(run => ask(`runs/${encodeURIComponent(run.run_id)}`).then(summary => ({events: summary.failures.filter(event => event.kind === "failed")}))))];
+  if (mine !== turn || from !== after) return;
   const fleet = pages[0].events;
   if (fleet.length) after = fleet.at(-1).sequence;
   log = [...log, ...fleet.filter(event => BAD.includes(event.kind))].slice(-KEPT);
-  return [...log, ...pages.slice(1).flatMap(page => page.events)].sort((a, b) => b.at_s - a.at_s).slice(0, KEPT);
+  lost = [...log, ...pages.slice(1).flatMap(page => page.events)].sort((a, b) => b.at_s - a.at_s).slice(0, KEPT);
+  looks = 1;
 }
 
 /** Merge failures of one reason, worker and message into the latest of them. */

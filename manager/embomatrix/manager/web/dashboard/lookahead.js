@@ -1,6 +1,7 @@
 // Look-ahead grid: coming steps by scenes, with loading states. The selected cell is described in words.
 import {at, counted, h, none, put} from "./dom.js";
 import {named, worded} from "./names.js";
+import {alike} from "./parts.js";
 
 const STEPS = 24;
 const COLUMNS = 60;
@@ -25,9 +26,11 @@ export function show({lookahead, runs}) {
   const cells = lookahead.flatMap(step => step.cells), warm = cells.filter(cell => cell.warmth === "warm").length;
   at("sum").textContent = cells.length ? `${warm} of ${counted(cells.length, "cell")} warm` : "";
   const names = Object.fromEntries(runs.map(run => [run.run_id, run.name || run.run_id]));
-  const byRun = Map.groupBy ? Map.groupBy(lookahead, step => step.run_id) : new Map([["", lookahead]]);
   labels = {};
-  const parts = [...byRun].map(([run, steps]) => [h("h3", {}, names[run] ?? run), grid(run, steps), problems(steps)]);
+  const parts = alike(lookahead, step => [step.run_id]).map(steps => {
+    const run = steps[0].run_id;
+    return [h("h3", {}, names[run] ?? run), grid(run, steps), problems(steps)];
+  });
   put(at("ahead"), parts.length && lookahead.length ? parts : none("No scenes announced. A trainer announces the scenes of its coming steps."));
   say(lookahead.length > 0);
 }

@@ -1,6 +1,6 @@
 // Overview: throughput, latency, prewarm hits, failures, runs.
 import {chart} from "./charts.js";
-import {at, count, h, none, put, seconds, share, signed, table} from "./dom.js";
+import {at, count, counted, h, none, put, seconds, share, signed, table} from "./dom.js";
 import {phaseTable} from "./parts.js";
 
 const TILES = [
@@ -31,9 +31,9 @@ export function show({overview: o, runs}) {
     rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: o.latency_p95_s ? `median; 95th percentile ${seconds(o.latency_p95_s)}` : "from submission to result",
     overheadnote: `manager's share of CPU time; ${share(o.core_share, 1)} of its core`,
     overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)}\u00a0%` : "–",
-    hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: o.prewarm_hits ? `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted` : "of announced scenes",
-    slots: `${o.slots_at_work.toFixed(1)}/${o.slots}`, slotsnote: `mean of a minute; ${count(o.queued)} rollouts queued`,
-    bad: count(o.failed), badnote: `${count(o.redispatched)} re-dispatched, ${count(o.stale_results)} late`,
+    hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: o.prewarm_hits ? `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted` : "scenes warm when their batch arrived",
+    slots: `${o.slots_at_work.toFixed(1)}/${o.slots}`, slotsnote: `mean of a minute; ${counted(o.queued, "rollout")} queued`,
+    bad: count(o.failed), badnote: `${count(o.redispatched)} re-dispatch${o.redispatched === 1 ? "" : "es"}, ${counted(o.stale_results, "late result")}`,
     peak: `peak ${count(Math.max(...o.throughput))}, ${count(o.outcomes.completed || 0)} in total`,
   };
   for (const [id, text] of Object.entries(texts)) at(id).textContent = text;

@@ -35,7 +35,7 @@ export function alike(items, causeOf) {
 
 /** Failed leases and rollouts of a run, the latest first, with their number by reason. */
 export function failureParts(events, redispatched) {
-  const again = `${counted(redispatched, "rollout")} ${redispatched === 1 ? "was" : "were"} leased again because ${redispatched === 1 ? "its" : "their"} worker left, drained or fell silent before it had a result.`;
+  const again = `Rollouts were leased again ${counted(redispatched, "time")}, because their workers left, drained or fell silent before they had a result.`;
   if (!events.length) return [none(redispatched ? `No lease failed. ${again}` : "None: every lease brought a result.")];
   const reasons = {};
   for (const {code} of events) reasons[code] = (reasons[code] ?? 0) + 1;

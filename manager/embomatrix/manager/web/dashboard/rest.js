@@ -1,5 +1,5 @@
 // REST API: each call with its parameters, its answer and an example, from the manager's OpenAPI description.
-import {Refused, ask} from "./ask.js";
+import {ask} from "./ask.js";
 import {at, h, put} from "./dom.js";
 import {saveJson} from "./save.js";
 
@@ -101,6 +101,6 @@ async function send(path, inputs, kind, said) {
     const text = JSON.stringify(await ask(`${own.replace("/api/v1/", "")}${query.size ? `?${query}` : ""}`), null, 1);
     said.textContent = text.length > SHOWN ? `${text.slice(0, SHOWN)}\n… ${text.length - SHOWN} more characters` : text;
   } catch (error) {
-    said.textContent = error instanceof Refused ? error.message : "the manager does not answer";
+    said.textContent = error.message;
   }
 }

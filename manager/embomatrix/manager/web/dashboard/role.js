@@ -1,6 +1,11 @@
 // Role of the viewer's token. Commands that it may not send are disabled, with the reason.
-import {Refused, ask, change} from "./ask.js";
+import {ask, change} from "./ask.js";
 import {at, h, put} from "./dom.js";
+
+/** States of workers that are no longer connected. */
+export const GONE = ["lost", "left"];
+/** Name of the command for a worker in this state. Resume ends a drain, and lifts a quarantine. */
+export const steering = state => ["draining", "quarantined"].includes(state) ? "Resume" : "Drain";
 
 let known = null, owner = null, asking = null;
 
@@ -25,7 +30,7 @@ export async function steer(path, ready = () => {}) {
   try {
     await change(path);
   } catch (error) {
-    at("answer").textContent = error instanceof Refused ? error.message : "the manager does not answer";
+    if (at("answer")) at("answer").textContent = error.message;
   }
   ready();
   dispatchEvent(new Event("embomatrix-changed"));

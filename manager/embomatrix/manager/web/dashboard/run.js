@@ -8,8 +8,11 @@ import {saveJson, savePage} from "./save.js";
 const CURVES = [["reward", "Reward per step"], ["success", "Success per step"]];
 const LOOK_EVERY = 3;
 let run_id = "", detail = null, drawn = {}, looks = 0, trained = null;
+/** Raised when the page is opened or closed: answers to an earlier page are not shown. */
+let turn = 0;
 
 export function open(main, id) {
+  turn += 1;
   run_id = id; detail = trained = null; looks = 0; drawn = {};
   main.replaceChildren(
     h("section", {}, h("h2", {}, h("a", {href: "#runs", class: "back"}, "All runs"), h("small", {id: "id"}, id)), h("p", {class: "instruction", id: "title"}, "Loading the run…"),
@@ -27,21 +30,30 @@ export function open(main, id) {
 }
 
 export function close() {
+  turn += 1;
   for (const one of Object.values(drawn)) one.close();
   drawn = {};
 }
 
 export async function show() {
-  if (detail?.run.closed_s || looks++ % LOOK_EVERY) return;
+  if (detail?.run.closed_s) return;
+  if (looks % LOOK_EVERY) {
+    looks += 1;
+    return;
+  }
+  const mine = turn, path = encodeURIComponent(run_id);
   try {
-    const [fresh, others] = await Promise.all([ask(`runs/${encodeURIComponent(run_id)}`), ask("runs?state=all")]);
-    if (fresh.trained) trained = await ask(`training/${encodeURIComponent(run_id)}`);
-    if (!at("ways") || fresh.run.run_id !== run_id) return;
-    detail = fresh;
+    const [fresh, others] = await Promise.all([ask(`runs/${path}`), ask("runs?state=all")]);
+    const reports = fresh.trained ? await ask(`training/${path}`) : null;
+    if (mine !== turn) return;
+    looks = 1;
+    detail = fresh; trained = reports;
     draw(others.items.filter(run => run.run_id !== run_id));
   } catch (error) {
     if (!(error instanceof Refused) || detail) throw error;
-    if (at("title")) at("title").textContent = error.message;
+    if (mine !== turn) return;
+    looks = 1;
+    at("title").textContent = error.message;
   }
 }
 

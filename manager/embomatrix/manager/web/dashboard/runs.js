@@ -1,15 +1,17 @@
 // Runs by name, open and closed. Two of them can be compared; each has a page of its own.
-import {Refused, ask} from "./ask.js";
-import {asked, at, count, decoded, h, moment, none, put, seconds, table} from "./dom.js";
+import {ask} from "./ask.js";
+import {asked, at, count, decoded, h, lastPage, moment, none, put, seconds, table} from "./dom.js";
 
 const ROWS = 50, TYPING_MS = 250, LOOK_EVERY = 3;
 const STATES = [["all", "open and closed"], ["open", "open"], ["closed", "closed"]];
 const filters = {state: "all", search: "", offset: 0};
 let chosen = [], inner = null, typed = 0, looks = 0, page = null;
+/** Raised by each request for a page of runs, and when the page is opened or closed: answers of earlier requests are not shown. */
+let asking = 0;
 
 export async function open(main) {
   const ids = asked() ? asked().split("&").map(decoded) : [];
-  inner = null; looks = 0; page = null;
+  inner = null; looks = 0; page = null; asking += 1;
   if (ids.length) {
     inner = await (ids.length > 1 ? import("./compare.js") : import("./run.js"));
     inner.open(main, ...ids);
@@ -17,7 +19,7 @@ export async function open(main) {
   }
   main.replaceChildren(h("section", {}, h("h2", {}, "Runs ", h("small", {id: "total"})),
     h("div", {class: "bar"},
-      h("input", {type: "search", placeholder: "name or id", "aria-label": "search by name or id", value: filters.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
+      h("input", {type: "search", maxlength: 128, placeholder: "name or id", "aria-label": "search by name or id", value: filters.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
       h("select", {"aria-label": "state", onchange: event => turn({state: event.target.value})}, STATES.map(([value, words]) => h("option", {value, selected: value === filters.state}, words))),
       h("button", {id: "before", type: "button", onclick: () => turn({offset: Math.max(0, filters.offset - ROWS)})}, "Previous"),
       h("button", {id: "after", type: "button", onclick: () => turn({offset: filters.offset + ROWS})}, "Next"),
@@ -28,23 +30,34 @@ export async function open(main) {
 }
 
 export function close() {
+  asking += 1;
   inner?.close();
   clearTimeout(typed);
 }
 
 export async function show(snapshot) {
   if (inner) { await inner.show(snapshot); return; }
-  if (looks++ % LOOK_EVERY === 0) await look();
+  if (looks % LOOK_EVERY) looks += 1;
+  else await look();
 }
 
 function turn(changes) {
   Object.assign(filters, {offset: 0}, changes);
-  look().catch(error => put(at("runs"), none(error instanceof Refused ? error.message : "the manager does not answer")));
+  const mine = asking + 1;
+  look().catch(error => { if (mine === asking) put(at("runs"), none(error.message)); });
 }
 
 async function look() {
-  page = await ask(`runs?${new URLSearchParams({...filters, limit: ROWS})}`);
-  if (at("picked")) list();
+  const mine = ++asking, found = await ask(`runs?${new URLSearchParams({...filters, limit: ROWS})}`);
+  if (mine !== asking) return;
+  if (!found.items.length && found.total) {
+    filters.offset = lastPage(found.total, ROWS);
+    await look();
+    return;
+  }
+  page = found;
+  looks = 1;
+  list();
 }
 
 function list() {

@@ -1,14 +1,45 @@
 // One task: instruction, objects, transcript, and the oracle's plan on the floor plan.
 import {ask, picture} from "./ask.js";
-import {at, categoryWords, h, put, splitWords, table} from "./dom.js";
+import {at, categoryWords, h, none, put, splitWords, table} from "./dom.js";
 import {close as stop, follower} from "./follow.js";
 import {drawn} from "./plan.js";
 
-export const close = stop;
+/** Raised when the page is opened or closed: answers to an earlier page are not shown. */
+let turn = 0;
 
-/** Show the task in a place; throws Refused. */
+export function close() {
+  turn += 1;
+  stop();
+}
+
+/** Show the task in a place, or why the manager does not show it. */
 export async function open(place, task_id) {
-  const detail = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = detail, about = new Set(detail.objects.filter(row => row.goal).map(row => row.name));
+  const mine = ++turn;
+  let detail;
+  try {
+    detail = await ask(`tasks/${encodeURIComponent(task_id)}`);
+  } catch (error) {
+    if (mine === turn) place.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), none(error.message)));
+    return;
+  }
+  if (mine !== turn) return;
+  draw(place, detail);
+  if (detail.card.picture) await depict(detail.card, mine);
+}
+
+/** Show the scene's picture, or why there is none. */
+async function depict(card, mine) {
+  let shown;
+  try {
+    shown = h("img", {alt: `rendered picture of ${card.scene_id}`, src: await picture(`scenes/${card.bundle_digest}/picture`)});
+  } catch (error) {
+    shown = none(error.message);
+  }
+  if (mine === turn) put(at("picture"), shown);
+}
+
+function draw(place, detail) {
+  const {card} = detail, about = new Set(detail.objects.filter(row => row.goal).map(row => row.name));
   const {moments} = detail, view = drawn(detail.floor, {rooms: detail.rooms, about, things: detail.things, label: `floor plan of ${card.scene_id}`});
   const facts = [["scene", card.scene_id], ["category", categoryWords(card.category)], ["split", splitWords(card.split)], ["source", detail.source], ["profile", detail.profile], ["goal type", detail.signature]];
   const {list, controls, go} = follower(view, moments, moments.map((moment, i) => ({words: moment.call || "start", moment: i, below: ""})));
@@ -24,7 +55,6 @@ export async function open(place, task_id) {
     detail.transcript ? h("section", {class: detail.tree ? "half" : ""}, h("h2", {}, "Transcript"), transcript(detail.transcript)) : "",
     detail.tree ? h("section", {class: detail.transcript ? "half" : ""}, h("h2", {}, "Layout tree"), tree(detail.tree)) : "");
   go(0);
-  if (card.picture) put(at("picture"), h("img", {alt: `rendered picture of ${card.scene_id}`, src: await picture(`scenes/${card.bundle_digest}/picture`)}));
 }
 
 function objects(rows) {

@@ -1,24 +1,26 @@
 // Tasks of the dataset: a gallery with pictures of their scenes, and a page for each task.
-import {Refused, ask, picture} from "./ask.js";
-import {at, categoryWords, count, counted, decoded, h, none, put, splitWords} from "./dom.js";
+import {ask, picture} from "./ask.js";
+import {at, categoryWords, count, counted, decoded, h, lastPage, none, put, splitWords} from "./dom.js";
 import {drawn} from "./plan.js";
 import * as task from "./task.js";
 
 const CARDS = 24, TYPING_MS = 250, AGAIN_MS = 5000;
 const filters = {search: "", scene: "", category: "", offset: 0};
 let pictures = new Map(), watcher = null, typed = 0, again = 0, total = 0;
+/** Number of the latest request for a page of tasks; answers of earlier ones are not shown. */
+let asked = 0;
 
 export function open(main) {
   const chosen = location.hash.split("?")[1];
   if (chosen) {
     main.replaceChildren(h("section", {}, none("Loading the task…")));
-    task.open(main, decoded(chosen)).catch(error => main.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), refused(error))));
+    task.open(main, decoded(chosen));
     return;
   }
   watcher = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(({target}) => { watcher.unobserve(target); look(target); }), {rootMargin: "200px"});
   main.replaceChildren(h("section", {}, h("h2", {}, "Scenes and tasks ", h("small", {id: "total"})),
     h("div", {class: "bar"},
-      h("input", {type: "search", placeholder: "words of the instruction", "aria-label": "search", value: filters.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
+      h("input", {type: "search", maxlength: 200, placeholder: "words of the instruction", "aria-label": "search", value: filters.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
       h("select", {id: "scene", "aria-label": "scene", onchange: event => turn({scene: event.target.value})}),
       h("select", {id: "category", "aria-label": "category", onchange: event => turn({category: event.target.value})}),
       h("button", {id: "before", type: "button", onclick: () => turn({offset: Math.max(0, filters.offset - CARDS)})}, "Previous"),
@@ -28,6 +30,7 @@ export function open(main) {
 }
 
 export function close() {
+  asked += 1;
   task.close();
   clearTimeout(typed);
   clearTimeout(again);
@@ -40,17 +43,24 @@ export function show() {}
 
 async function turn(changes) {
   Object.assign(filters, {offset: 0}, changes);
+  const mine = ++asked;
   let shown = false;
   try {
     const page = await ask(`tasks?${new URLSearchParams({...filters, limit: CARDS})}`);
-    if (watcher) list(page);
+    if (mine !== asked) return;
+    if (!page.items.length && page.total) {
+      turn({offset: lastPage(page.total, CARDS)});
+      return;
+    }
+    list(page);
     shown = !page.notice;
   } catch (error) {
-    if (watcher) put(at("cards"), refused(error));
+    if (mine !== asked) return;
+    put(at("cards"), none(error.message));
   }
   clearTimeout(again);
   // A dataset may be written while the page is open.
-  if (watcher && !shown) again = setTimeout(() => turn({offset: filters.offset}), AGAIN_MS);
+  if (!shown) again = setTimeout(() => turn({offset: filters.offset}), AGAIN_MS);
 }
 
 function list(page) {
@@ -83,7 +93,7 @@ async function look(place) {
       place.replaceChildren(drawn(await once(`scenes/${digest}/floor`, ask), {label: `floor plan of ${scene}`}).picture);
     }
   } catch (error) {
-    place.replaceChildren(refused(error));
+    place.replaceChildren(none(error.message));
   }
 }
 
@@ -93,5 +103,3 @@ function once(path, how) {
   if (!pictures.has(path)) pictures.set(path, how(path).catch(error => { pictures.delete(path); throw error; }));
   return pictures.get(path);
 }
-
-const refused = error => none(error instanceof Refused ? error.message : "the manager does not answer");

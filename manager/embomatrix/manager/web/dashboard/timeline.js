@@ -7,8 +7,11 @@ const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRI
 const SPANS = [10, 60, 300, 1800];
 const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"], ["idle", "chip"]];
 let run = "", timeline = null, view = null, live = true, span = 60, painted = [], grabbed = null, edge = NAMES, search = "", typed = 0;
+/** Raised when the page is opened or closed: answers to an earlier page are not shown. */
+let turn = 0;
 
 export function open(main) {
+  turn += 1;
   run = decoded(location.hash.split("?")[1] ?? "");
   timeline = view = null; live = true;
   const legend = KINDS.map(([word, tint]) => [h("i", {style: `background:var(--${tint})`}), word]);
@@ -16,7 +19,7 @@ export function open(main) {
     h("h2", {}, "Slots ", h("small", {id: "range"}), h("span", {class: "legend"}, legend)),
     h("div", {class: "bar"},
       h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; timeline = view = null; live = true; dispatchEvent(new Event("embomatrix-changed")); }}),
-      h("input", {type: "search", placeholder: "worker", "aria-label": "search by worker", value: search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => { search = event.target.value; follow(); }, TYPING_MS); }}),
+      h("input", {type: "search", maxlength: 128, placeholder: "worker", "aria-label": "search by worker", value: search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => { search = event.target.value; follow(); }, TYPING_MS); }}),
       h("select", {"aria-label": "time range", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
       h("button", {type: "button", onclick: () => zoom(0.5, live ? 1 : 0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2, live ? 1 : 0.5)}, "Zoom out"),
       h("button", {type: "button", onclick: () => pan(-0.25)}, "Earlier"), h("button", {type: "button", onclick: () => pan(0.25)}, "Later"),
@@ -25,13 +28,23 @@ export function open(main) {
     h("div", {id: "tracks"})));
 }
 
+export function close() {
+  turn += 1;
+  clearTimeout(typed);
+}
+
+const address = () => `runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`;
+
 export async function show({runs}) {
   const known = runs.map(r => r.run_id);
   if (!run) run = (runs.findLast(r => r.pending || r.stats.delivered) ?? runs.at(-1))?.run_id ?? "";
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
   if (!run) { put(at("tracks"), none("No open run. Closed runs are on the page Runs.")); return; }
   if (!live && timeline) { draw(); return; } // the window or the theme may be another by now
-  timeline = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
+  const mine = turn, wanted = address(), found = await ask(wanted);
+  // The viewer may have chosen something else, or left the page.
+  if (mine !== turn || wanted !== address()) return;
+  timeline = found;
   if (live) {
     const first = Math.min(...timeline.tracks.flatMap(track => track.spans.map(one => one.begin_s - one.load_s)));
     view = {from: Math.min(timeline.until_s - LEAST_S, Math.max(timeline.until_s - span, first)), until: timeline.until_s};

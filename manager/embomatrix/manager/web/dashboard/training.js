@@ -1,7 +1,7 @@
 // Training: reward by tier, success, zero-variance groups, time, and sampled plans with their results.
 import {Refused, ask} from "./ask.js";
 import {chart} from "./charts.js";
-import {asked, at, categoryWords, clock, count, decoded, h, none, put, seconds, share, table} from "./dom.js";
+import {asked, at, categoryWords, clock, count, counted, decoded, h, none, put, seconds, share, table} from "./dom.js";
 import {sampledPlans} from "./parts.js";
 
 const CHARTS = [
@@ -13,14 +13,19 @@ const CHARTS = [
   ["loss", "Imitation", "loss per token", {loss: "loss", validation: "validation loss"}],
 ];
 const TILES = [["step", "Step"], ["reward", "Reward"], ["solved", "Success"], ["flat", "Zero-variance groups"], ["entropy", "Entropy"], ["long", "Plan length"]];
+/** Figure of each tile but the first, whose latest values are averaged. */
+const MEANS = {reward: "reward", solved: "success", flat: "zero_variance_groups", entropy: "entropy", long: "plan_steps"};
 const LATEST = 10;
 /** Run of the page's address, whose reports the manager may have on disk only. */
 let wanted = "";
 let run = "", seen = "", drawn = {}, report = null;
+/** Raised when the page is opened or closed: answers to an earlier page are not shown. */
+let turn = 0;
 /** Page of one plan, if the address names one. */
 let inner = null;
 
 export async function open(main) {
+  turn += 1;
   const [named, plan] = asked().split("&").map(decoded);
   run = wanted = named;
   seen = ""; drawn = {}; report = null; inner = null;
@@ -41,7 +46,12 @@ export async function open(main) {
 }
 
 export function close() {
+  turn += 1;
   inner?.close();
+  clear();
+}
+
+function clear() {
   for (const one of Object.values(drawn)) one.close();
   drawn = {};
 }
@@ -60,16 +70,18 @@ export async function show({training}) {
   put(at("nothing"), run ? [] : h("section", {}, none("No trainer has reported yet. Start one with embomatrix train, and --manager if the manager is on another machine.")));
   const view = every.find(one => one.run_id === run);
   if (!view || seen === `${run} ${view.revision}`) return;
+  const mine = turn, chosen = run;
   let fresh;
   try {
-    fresh = await ask(`training/${encodeURIComponent(run)}`);
+    fresh = await ask(`training/${encodeURIComponent(chosen)}`);
   } catch (error) {
     if (!(error instanceof Refused) || !archived.length) throw error;
-    put(at("nothing"), h("section", {}, none(error.message)));
+    if (mine === turn && chosen === run) put(at("nothing"), h("section", {}, none(error.message)));
     return;
   }
-  if (!at("sampled")) return;
-  if (report?.run.run_id !== run) close();
+  // The viewer may have chosen another run, or left the page.
+  if (mine !== turn || chosen !== run) return;
+  if (report?.run.run_id !== run) clear();
   report = fresh;
   seen = `${run} ${fresh.run.revision}`;
   draw(fresh);
@@ -92,15 +104,14 @@ function draw({run: view, phases, plans, plans_step}) {
 }
 
 function tiles({steps, figures}) {
-  const mean = name => {
-    const latest = (figures[name] ?? []).slice(-LATEST).filter(value => value !== null);
-    return latest.length ? latest.reduce((a, b) => a + b, 0) / latest.length : null;
-  };
+  // Some figures are not reported with every step.
+  const latest = name => (figures[name] ?? []).filter(value => value !== null).slice(-LATEST);
+  const mean = name => latest(name).length ? latest(name).reduce((a, b) => a + b, 0) / latest(name).length : null;
   const fixed = (name, digits) => mean(name) === null ? "–" : mean(name).toFixed(digits);
   const part = name => mean(name) === null ? "–" : share(mean(name), 1);
-  const texts = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed("reward", 2), solved: part("success"), flat: part("zero_variance_groups"), entropy: fixed("entropy", 3), long: fixed("plan_steps", 1)};
+  const texts = {step: steps.length ? count(steps.at(-1)) : "–", reward: fixed(MEANS.reward, 2), solved: part(MEANS.solved), flat: part(MEANS.flat), entropy: fixed(MEANS.entropy, 3), long: fixed(MEANS.long, 1)};
   for (const [id, text] of Object.entries(texts)) at(id).textContent = text;
-  for (const [id] of TILES.slice(1)) at(`${id}note`).textContent = `mean of ${Math.min(LATEST, steps.length)} steps`;
+  for (const [id, name] of Object.entries(MEANS)) at(`${id}note`).textContent = latest(name).length ? `mean of ${counted(latest(name).length, "step")}` : "";
   at("stepnote").textContent = mean("seconds") === null ? "" : `${seconds(mean("seconds"))} each`;
 }
 

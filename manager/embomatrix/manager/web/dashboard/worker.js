@@ -3,17 +3,20 @@ import {Refused, ask} from "./ask.js";
 import {chart} from "./charts.js";
 import {at, count, h, none, put, seconds, share, table} from "./dom.js";
 import {named, worded} from "./names.js";
-import {command, learnRole, showRefusal, steer} from "./role.js";
+import {GONE, command, learnRole, showRefusal, steer, steering} from "./role.js";
 
-const LOOK_EVERY = 2, GONE = ["lost", "left"];
+const LOOK_EVERY = 2;
 /** Ticks at whole minutes of the day. */
 const MINUTES = [60, 120, 300, 600, 1800];
 const timeOfDay = at_s => `${new Date(at_s * 1000).toISOString().slice(11, 16)} UTC`;
 /** Scenes that are listed at first. */
 const SCENES = 12;
 let name = "", looks = 0, drawn = {}, held = null, whole = false;
+/** Raised when the page is opened or closed: answers to an earlier page are not shown. */
+let turn = 0;
 
 export function open(main, worker_id) {
+  turn += 1;
   name = worker_id; looks = 0; drawn = {}; whole = false;
   main.replaceChildren(
     h("section", {}, h("h2", {}, h("a", {href: "#workers"}, "All workers")), h("p", {class: "instruction", id: "title"}, worker_id),
@@ -36,16 +39,22 @@ function drawScenes() {
 }
 
 export function close() {
+  turn += 1;
   for (const one of Object.values(drawn)) one.close();
   drawn = {};
 }
 
 export async function show() {
-  if (looks++ % LOOK_EVERY) return;
-  const path = `workers/${encodeURIComponent(name)}`;
+  if (looks % LOOK_EVERY) {
+    looks += 1;
+    return;
+  }
+  const mine = turn, path = `workers/${encodeURIComponent(name)}`;
   try {
     const [{worker, host}, {lines}] = await Promise.all([ask(path), ask(`${path}/log`), learnRole()]);
-    if (!at("log") || worker.worker_id !== name) return;
+    if (mine !== turn) return;
+    looks = 1;
+    at("title").textContent = name;
     for (const id of ["scenes", "log"]) at(id).closest("section").hidden = false;
     about(worker);
     machine(worker, host);
@@ -54,15 +63,24 @@ export async function show() {
     put(at("log"), lines.length ? h("pre", {class: "log", tabindex: "0"}, lines.join("\n")) : none("The worker has sent no lines: it has joined just now, runs with --no-send-log, or is older than this manager."));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    if (at("title")) at("title").textContent = error.message;
+    if (mine === turn) refused(error.message);
   }
 }
 
+/** Show why there are no facts, and none of the earlier ones. */
+function refused(why) {
+  looks = 1;
+  at("title").textContent = why;
+  for (const id of ["command", "facts"]) put(at(id));
+  for (const id of ["cpu", "memory", "scenes", "log"]) at(id).closest("section").hidden = true;
+  at("main").querySelector(".machine").hidden = true;
+}
+
 function about(w) {
-  const away = w.state === "draining", labels = Object.entries(w.labels).map(([key, value]) => `${key} ${value}`).join(", ");
-  put(at("command"), GONE.includes(w.state) ? [] : h("button", command({type: "button"}), away ? "Resume" : "Drain"));
+  const word = steering(w.state), labels = Object.entries(w.labels).map(([key, value]) => `${key} ${value}`).join(", ");
+  put(at("command"), GONE.includes(w.state) ? [] : h("button", command({type: "button"}), word));
   const button = at("command").querySelector("button");
-  if (button) button.onclick = () => steer(`workers/${encodeURIComponent(name)}/${away ? "resume" : "drain"}`, () => { looks = 0; });
+  if (button) button.onclick = () => steer(`workers/${encodeURIComponent(name)}/${word.toLowerCase()}`, () => { looks = 0; });
   showRefusal();
   const facts = [["state", [h("span", {class: `dot ${w.state}`}), w.state, w.reason && ` (${w.reason})`]], ["slots", `${w.busy} of ${w.slots} busy${w.waiting ? `, ${count(w.waiting)} rollouts wait behind them` : ""}`],
     ["completed", count(w.completed)], ["cores", count(w.cores)], ["memory for scenes", `${count(w.memory_used_mb)} of ${count(w.memory_mb)} MB`], ["GPU", w.gpu], ["labels", labels],
@@ -76,10 +94,10 @@ function machine(worker, host) {
   for (const id of ["cpu", "memory"]) at(id).closest("section").hidden = !known;
   at("main").querySelector(".machine").hidden = known;
   if (!known) return;
-  const options = {across: "from", words: timeOfDay, steps: MINUTES, fill: true};
+  const options = {across: "from", words: timeOfDay, steps: MINUTES, fill: true, joined: false};
   drawn.cpu ??= chart(at("cpu"), ["% of all cores"], {...options, most: 100});
   drawn.memory ??= chart(at("memory"), ["MB used"], {...options, most: host.memory_mb});
-  drawn.cpu.draw(host.at_s, [host.cpu_share.map(share => 100 * share)]);
+  drawn.cpu.draw(host.at_s, [host.cpu_share.map(used => used === null ? null : 100 * used)]);
   drawn.memory.draw(host.at_s, [host.memory_used_mb]);
   at("cpunow").textContent = worker.host ? `${share(worker.host.cpu_share, 1)} of ${count(worker.cores)} cores now, by all programs` : "";
   at("memorynow").textContent = worker.host ? `${count(worker.host.memory_used_mb)} of ${count(worker.host.memory_mb)} MB now, by all programs` : "";

@@ -1,11 +1,10 @@
 // Workers: scenes, slots, state, machine, and the commands drain and resume. Each has a page of its own.
-import {asked, at, count, decoded, gauge, h, none, put, seconds, share, table} from "./dom.js";
+import {asked, at, count, decoded, gauge, h, lastPage, none, put, seconds, share, table} from "./dom.js";
 import {named, worded} from "./names.js";
-import {command, learnRole, refusal, showRefusal, steer} from "./role.js";
+import {GONE, command, learnRole, refusal, showRefusal, steer, steering} from "./role.js";
 
 const ROWS = 50, CHIPS = 6;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined", "left"];
-const GONE = ["lost", "left"];
 const filters = {state: "", search: "", offset: 0, limit: ROWS};
 let inner = null;
 
@@ -26,7 +25,7 @@ export async function open(main) {
   main.replaceChildren(h("section", {},
     h("h2", {}, "Workers ", h("small", {id: "total"})),
     h("div", {class: "bar"},
-      h("input", {type: "search", placeholder: "name or label", "aria-label": "search by name or label", value: filters.search, oninput: event => ask({search: event.target.value})}),
+      h("input", {type: "search", maxlength: 128, placeholder: "name or label", "aria-label": "search by name or label", value: filters.search, oninput: event => ask({search: event.target.value})}),
       h("select", {"aria-label": "state", onchange: event => ask({state: event.target.value})}, options),
       h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, filters.offset - ROWS)})}, "Previous"),
       h("button", {id: "after", type: "button", onclick: () => ask({offset: filters.offset + ROWS})}, "Next"),
@@ -43,6 +42,10 @@ export async function show({workers, paused}) {
   if (inner) { await inner.show(); return; }
   await learnRole();
   if (!at("workers")) return;
+  if (!workers.items.length && workers.total) {
+    ask({offset: lastPage(workers.total, ROWS)});
+    return;
+  }
   showRefusal();
   const last = Math.min(workers.total, workers.offset + workers.items.length);
   at("total").textContent = workers.total ? `${count(workers.offset + 1)} to ${count(last)} of ${count(workers.total)}` : "";
@@ -60,7 +63,7 @@ export async function show({workers, paused}) {
 
 function row(w) {
   const used = w.residents.reduce((sum, r) => sum + r.memory_mb, 0);
-  const away = w.state === "draining", labels = Object.entries(w.labels).map(([name, value]) => `${name} ${value}`);
+  const word = steering(w.state), order = word.toLowerCase(), labels = Object.entries(w.labels).map(([name, value]) => `${name} ${value}`);
   return h("tr", {},
     h("td", {class: "named"}, h("a", {href: `#workers?${encodeURIComponent(w.worker_id)}`}, w.worker_id), w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`), labels.length > 0 && h("div", {class: "muted labels"}, labels.join(", "))),
     h("td", {class: w.reason ? "why" : "fit"}, h("span", {class: `dot ${w.state}`}), w.state, w.reason && h("span", {class: "muted"}, ` ${w.reason}`)),
@@ -69,7 +72,7 @@ function row(w) {
     h("td", {class: "wideonly"}, gauge(used, w.memory_mb, `${count(Math.round(used))} of ${count(w.memory_mb)} MB`)),
     h("td", {class: "n", "data-name": "completed"}, count(w.completed)), h("td", {class: "fit", "data-name": "machine"}, machine(w)),
     h("td", {class: "n muted wideonly"}, w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`),
-    h("td", {class: "fit act"}, !GONE.includes(w.state) && h("button", command({class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}), away ? "Resume" : "Drain")));
+    h("td", {class: "fit act"}, !GONE.includes(w.state) && h("button", command({class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${order}`, "aria-label": `${order} ${w.worker_id}`}), word)));
 }
 
 /** Cores, and the use of CPU and memory by all programs of the machine. */
