@@ -94,6 +94,17 @@ def test_a_scene_on_both_sides_is_refused(parts, kitchen):
         join_parts(parts, (1, 2))
 
 
+def test_tasks_stay_when_parts_cannot_be_joined(parts, kitchen):
+    joined = join_parts(parts, (1, 2))
+    _written(part_folder(parts, 2), kitchen, ("heldout",), "Rs_int", "c", room="pantry_0")
+    with pytest.raises(DatasetError, match="tasks in Rs_int are trained on and held out"):
+        join_parts(parts, (1, 2))
+    with pytest.raises(DatasetError, match=r"part 3 is not complete .* factory corpus --out \S+ --part 3`"):
+        join_parts(parts, (1, 3))
+    assert Dataset.load(parts / TASKS).records == joined.records
+    assert sorted(path.name for path in parts.iterdir()) == ["parts", "tasks"]
+
+
 def test_the_hardest_held_out_tasks_are_frozen(parts):
     join_parts(parts, (1, 2))
     hard = {"Ihlen_1_int-e", "Ihlen_1_int-f", "Rs_int-a"}
@@ -189,6 +200,30 @@ def test_a_part_that_is_built_again_is_compared_with_the_shipped_one(shipping, t
     assert f"part 1: the recipe gives 2 tasks with {built}, and the shipped part has 2 with" in said
     assert "part 2: 3 tasks" in said, "the others are compared all the same"
     assert "this version builds other tasks than the shipped part 1" in said
+
+
+def test_a_part_is_unpacked_where_its_build_was_interrupted(shipping, tmp_path):
+    folder = part_folder(tmp_path / "c", 1)
+    folder.mkdir(parents=True)
+    (folder / "build.jsonl").touch()
+    for _ in range(2):
+        code, said = _run("--out", tmp_path / "c", "--part", 1)
+        assert code == 0, said
+        assert "5 tasks in" in said
+    assert [record.signature for record in Dataset.load(folder).records] == ["a", "b"]
+
+
+def test_a_build_stands_in_for_a_shipped_part_only_if_it_gives_its_tasks(shipping, tmp_path):
+    assert _run("--out", tmp_path / "c", "--check", "--part", 2)[0] == 0
+    code, said = _run("--out", tmp_path / "c", "--part", 2)
+    assert code == 0, said
+    assert _run("--out", tmp_path / "d", "--check")[0] == 2
+    tasks = Dataset.load(tmp_path / "d" / TASKS).records
+    code, said = _run("--out", tmp_path / "d", "--part", 3)
+    assert code == 2
+    assert "holds a build that differs from part 1 as it ships: name another folder with --out" in said
+    assert not part_folder(tmp_path / "d", 3).exists(), "nothing is built first"
+    assert Dataset.load(tmp_path / "d" / TASKS).records == tasks
 
 
 def test_unknown_parts_and_parts_that_cannot_be_checked_are_refused(shipping, tmp_path):

@@ -12,16 +12,20 @@ from typing import Never
 
 import numpy as np
 import pytest
+from tests.fakes.datasets import write_kitchen_dataset
 
+from embomatrix.factory.admission import RefusalReason
 from embomatrix.factory.days import maker as days_maker
+from embomatrix.factory.days.drafts import _renamed, _without
 from embomatrix.factory.days.laying import LaidOut, lay_out
-from embomatrix.factory.days.maker import DAYS, DayMaker
+from embomatrix.factory.days.maker import DAYS, DayMaker, days_with_proofs
 from embomatrix.factory.days.planning import PlannedDay, need_weights, plan_day
 from embomatrix.factory.days.proofs import DayProofs
 from embomatrix.factory.language import clauses
 from embomatrix.factory.language.kinds import is_held_out
-from embomatrix.factory.pipeline.build import build_dataset, split_scenes
+from embomatrix.factory.pipeline.build import _SplitOrders, build_dataset, split_scenes
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.factory.pipeline.store import BuildStore, Rejection, VariantResult, VariantYield
 from embomatrix.factory.pipeline.variants import VariantOrder
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
@@ -29,11 +33,11 @@ from embomatrix.factory.social.day import NeedOfDay, draw_needs, wish_of
 from embomatrix.factory.social.household import draw_cast
 from embomatrix.factory.social.knowledge import Need, events
 from embomatrix.factory.social.values import Cast
-from embomatrix.factory.social.wish import problem_of
+from embomatrix.factory.social.wish import Condition, WishPredicate, problem_of
 from embomatrix.factory.writer.tasks import Draft
 from embomatrix.starter.archive import pack
 from embomatrix.world.bddl import parse_problem, render_problem
-from embomatrix.world.dataset import Dataset, write_dataset
+from embomatrix.world.dataset import Dataset, DatasetError, write_dataset
 from embomatrix.world.evaluate import ground_size
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import TaskCategory
@@ -155,6 +159,32 @@ def test_days_of_training_have_no_need_of_the_held_out_split(bases: dict[str, Sc
     assert not {name for name in drawn if is_held_out(name, 0, 5)}
 
 
+def test_labels_of_a_premise_are_renamed_with_those_of_its_condition() -> None:
+    premise = Condition(predicate=WishPredicate.OPEN, things="fridge")
+    condition = Condition(predicate=WishPredicate.TOGGLED_ON, things="lamp", provided=premise)
+    renamed = _renamed(condition, {label: f"{label}_1" for label in condition.labels})
+    assert renamed.labels == ("lamp_1", "fridge_1")
+    assert _without(renamed, "_1") == condition
+
+
+def test_a_build_tells_each_order_the_earlier_instructions_of_its_own_home(
+    bases: dict[str, Scene], tmp_path: Path
+) -> None:
+    record = next(iter(Dataset.load(write_kitchen_dataset(tmp_path / "kitchen")).records))
+    store = BuildStore(tmp_path / "build", {})
+    names = [base.base for base in bases.values()]
+    for number in range(6):
+        task = dataclasses.replace(
+            record.task, scene_id=f"{names[number % 3]}-train-{number:03d}", instruction=f"Wish {9 - number}."
+        )
+        found = dataclasses.replace(record, task=task, split="train", signature=str(number))
+        store.add(VariantYield(VariantResult("train", number, (found,), ()), b"", {}))
+    rooms = {base.base: tuple(room.name for room in base.rooms) for base in bases.values()}
+    orders = _SplitOrders(store, list(bases.values()), rooms, "train", 40, DAYS)
+    told = {order.base: order.told for order in orders.next_round()}
+    assert told == {name: (f"Wish {9 - at}.", f"Wish {6 - at}.") for at, name in enumerate(names)}
+
+
 def test_a_day_depends_only_on_settings_and_order() -> None:
     settings = BuildSettings(reachability=False, physical=False, writer=WriterKind.SOCIAL)
     rooms = tuple(room.name for room in build_base_scene("Pomaria_1_int").rooms)
@@ -182,7 +212,13 @@ def test_tasks_that_differ_only_in_words_keep_their_proofs(
     with contextlib.closing(DayMaker(settings)) as maker:
         earlier = maker.make(order)
         records = earlier.result.records
-        write_dataset(tmp_path, records, {records[0].bundle_digest: earlier.bundle})
+        refused = Rejection(
+            earlier.result.records[0].task.scene_id, "", "Once.", "", RefusalReason.SHORTCUT, "It has one."
+        )
+        result = dataclasses.replace(earlier.result, rejections=(*earlier.result.rejections, refused))
+        store = BuildStore(tmp_path, dataclasses.asdict(settings))
+        store.add(dataclasses.replace(earlier, result=result))
+        write_dataset(tmp_path, records, {})
         words = dict(clauses._phrases())
         words["forms"] = {**words["forms"], "do": ["Be an angel and {do}."]}
         monkeypatch.setattr(clauses, "_phrases", lambda: words)
@@ -198,6 +234,8 @@ def test_tasks_that_differ_only_in_words_keep_their_proofs(
     assert retold.result.records != records
     assert any("Be an angel" in record.task.instruction for record in retold.result.records)
     assert (retold.bundle, retold.transcripts) == (anew.bundle, anew.transcripts)
+    assert retold.result.rejections == (*anew.result.rejections, refused)
+    assert retold.retold
 
     planned = plan_day(order, base, 0)
     assert isinstance(planned, PlannedDay)
@@ -206,6 +244,7 @@ def test_tasks_that_differ_only_in_words_keep_their_proofs(
     again = proofs.retold(planned, order)
     assert again is not None
     assert again.result.records == retold.result.records
+    assert again.result.rejections == (), "a packed part has no refusals"
     moved = dataclasses.replace(planned.scene, seed=planned.scene.seed + 1)
     assert proofs.retold(dataclasses.replace(planned, scene=moved), order) is None, "another scene"
     assert proofs.retold(dataclasses.replace(planned, tasks=planned.tasks[1:]), order) is None
@@ -213,6 +252,32 @@ def test_tasks_that_differ_only_in_words_keep_their_proofs(
     elsewhere = plan_day(other, base, 0)
     assert isinstance(elsewhere, PlannedDay)
     assert proofs.retold(elsewhere, other) is None, "a day without proofs"
+
+
+def test_proofs_under_other_settings_are_refused(tmp_path: Path) -> None:
+    settings = BuildSettings(reachability=False, physical=False, writer=WriterKind.SOCIAL)
+    BuildStore(tmp_path, dataclasses.asdict(settings))
+    write_dataset(tmp_path, [], {})
+    with contextlib.closing(DayMaker(settings, proofs=tmp_path)):
+        pass
+    for name, found, expected in (
+        ("physical", False, True),
+        ("reachability", False, True),
+        ("shortcut_plans", 16, 64),
+    ):
+        other = dataclasses.replace(settings, **{name: expected})
+        for begin in (days_with_proofs, lambda path, wanted: DayMaker(wanted, proofs=path)):
+            with pytest.raises(
+                DatasetError, match=f"the setting {name} {found}, expected {expected}: name a"
+            ):
+                begin(tmp_path, other)
+    pack(Dataset.load(tmp_path), tmp_path / "packed.xz")
+    days_with_proofs(tmp_path / "packed.xz", BuildSettings(writer=WriterKind.SOCIAL))
+    with pytest.raises(DatasetError, match="physical True, expected False"):
+        days_with_proofs(tmp_path / "packed.xz", settings)
+    (tmp_path / "build.jsonl").unlink()
+    with pytest.raises(DatasetError, match="does not hold the settings of a build"):
+        days_with_proofs(tmp_path, settings)
 
 
 def test_held_out_scenes_are_others_than_those_of_training(bases: dict[str, Scene]) -> None:

@@ -1,5 +1,6 @@
 """Evaluations: diversity of tasks, aesthetics score of layouts, admission figures, and the page of figures."""
 
+import asyncio
 import dataclasses
 import gzip
 import json
@@ -34,7 +35,7 @@ from embomatrix.factory.evaluate.aesthetics_fit import (
     half_added,
     held_out_scores,
 )
-from embomatrix.factory.evaluate.judges import DiversityScores
+from embomatrix.factory.evaluate.judges import DiversityScores, with_judge
 from embomatrix.factory.evaluate.page import BEGIN, END, with_factory
 from embomatrix.factory.evaluate.room_plans import FLOOR, RoomBox, RoomPlan, plan_of, read_rooms
 from embomatrix.factory.evaluate.spoilers import SPOILERS
@@ -53,6 +54,7 @@ from embomatrix.factory.metrics.figures import (
     read_evaluation,
 )
 from embomatrix.factory.pipeline.corpus import training_scenes
+from embomatrix.llm.values import Reply, Usage
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.starter.recipes import PARTS
 from embomatrix.world.catalog import Catalog
@@ -384,6 +386,21 @@ def test_admission_rate_uses_recorded_times_of_variants_and_base_scenes(tmp_path
     assert "| admitted_per_hour |" in with_factory("", [found])
 
 
+def test_drafts_that_an_earlier_build_proved_are_no_part_of_admission(tmp_path):
+    here = {"split": "train", "variant": 0, "cpu_s": 5.0}
+    retold = {"split": "train", "variant": 1, "retold": True, "cpu_s": 0.1}
+    a_build(tmp_path, "social", [here, retold])
+    found = evaluate_admissions(tmp_path)
+    assert (found.figure("admitted_share").value, found.figure("admitted_share").n) == (100 * 2 / 3, 3)
+    assert found.figure("admitted_per_hour").value == 2 * 3600 * 2 / 5.0
+    assert found.notes[1] == "1 drafts are left out, because an earlier build proved or refused them."
+    assert [figure.n for figure in admitted_share(tmp_path)] == [3]
+    a_build(tmp_path, "social", [retold, {**retold, "variant": 0}])
+    assert admitted_share(tmp_path) == ()
+    with pytest.raises(EvaluationError, match="an earlier build proved all tasks of"):
+        evaluate_admissions(tmp_path)
+
+
 def test_plain_writer_figures_have_no_goals_and_untimed_builds_no_rate(tmp_path):
     a_build(tmp_path, "plain", [])
     found = evaluate_admissions(tmp_path)
@@ -403,6 +420,34 @@ def test_folder_that_is_no_build_is_reported_in_a_sentence(tmp_path):
 def test_judge_scores_from_0_to_10():
     with pytest.raises(ValueError, match="less than or equal to 10"):
         DiversityScores.model_validate({"variety": 8, "characters": 9, "overall": 11, "explanation": "x"})
+
+
+class ScriptedJudge:
+    """Judge that gives these answers and repeats the last one."""
+
+    def __init__(self, *answers):
+        self._answers = list(answers)
+
+    async def complete(self, request):
+        text = self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
+        return Reply(text, "judge-1", Usage(), "stop", 0.0)
+
+
+SCORES = '{"variety": 8, "characters": 6, "overall": 7, "explanation": "x"}'
+
+
+def test_unusable_answers_of_a_judge_are_counted_and_cost_no_figure():
+    groups = [["Open the fridge."], ["Close the fridge."]]
+    asked = asyncio.run(with_judge(EVALUATION, ScriptedJudge(SCORES), groups, 0))
+    assert (asked.figure("judge overall").value, asked.figure("judge overall").n) == (7.0, 2)
+    assert asked.conditions == {**EVALUATION.conditions, "judge": "judge-1"}
+    assert asked.figures[:2] == EVALUATION.figures
+    once = asyncio.run(with_judge(EVALUATION, ScriptedJudge("no", "no", "no", SCORES), groups, 0))
+    assert once.figure("judge variety").n in (1, 2)
+    never = asyncio.run(with_judge(EVALUATION, ScriptedJudge("no"), groups, 0))
+    assert never.figures == EVALUATION.figures
+    assert never.notes == ("A note.", "2 scenes got no usable answer of the judge.")
+    assert never.conditions["judge"] == "judge-1"
 
 
 def test_command_reports_user_errors_in_a_sentence(tmp_path):

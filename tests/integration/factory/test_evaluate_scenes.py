@@ -1,13 +1,17 @@
 """Scene evaluation: every flaw is detected, valid scenes have none, and rates are correct."""
 
+import contextlib
 import json
 from dataclasses import replace
 from importlib import resources
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
 
+from embomatrix.factory.admission import MAX_HELD_SHARE
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.evaluate import scenes
 from embomatrix.factory.evaluate.scene_geometry import Flaw, flaws_of
 from embomatrix.factory.evaluate.scenes import (
     LIST,
@@ -20,17 +24,20 @@ from embomatrix.factory.evaluate.scenes import (
     fixed_tasks,
     interval_of_mean,
     outcome_log,
+    task_list_settings,
 )
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.request import RequestedObject
 from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import SceneEditor
+from embomatrix.factory.task_import.batch import max_held_share
 from embomatrix.factory.task_import.sources import SourceText, read_activity
 from embomatrix.factory.task_import.task import ImportOptions, import_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError
 from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import PoseCache
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -175,6 +182,58 @@ def test_outcomes_of_another_seed_are_rejected(tmp_path: "Path", content: str, m
     with pytest.raises(DatasetError, match=message):
         outcome_log(path, 0)
     assert path.read_text(encoding="utf-8") == content
+
+
+ANSWER = {
+    "question": "q",
+    "number": 0,
+    "text": "",
+    "prompt_tokens": 0,
+    "completion_tokens": 0,
+    "finish": "stop",
+}
+
+
+def test_a_log_belongs_to_one_source_of_poses_and_one_list_of_tasks(tmp_path: "Path") -> None:
+    one, other = tmp_path / "one.jsonl", tmp_path / "other.jsonl"
+    for path, model in ((one, "small-1"), (other, "small-2")):
+        path.write_text(json.dumps({**ANSWER, "model": model}) + "\n", encoding="utf-8")
+    known = PoseSource(one).settings()
+    assert known["pose model"] == "small-1"
+    tasks = [SourceText(name, UNICORN, "embomatrix", scene="Rs_int") for name in ("known", "new")]
+    log = tmp_path / "outcomes.jsonl"
+    outcome_log(log, 0, {**task_list_settings(tasks), **known})
+    outcome_log(log, 0, {**task_list_settings(tasks), **PoseSource(one).settings()})
+    with pytest.raises(
+        DatasetError, match="other settings \\(pose model small-1, now small-2, pose recording"
+    ):
+        outcome_log(log, 0, {**task_list_settings(tasks), **PoseSource(other).settings()})
+    with pytest.raises(DatasetError, match="other settings \\(task list sha256:"):
+        outcome_log(log, 0, {**task_list_settings(tasks[:1]), **known})
+    growing = PoseSource(one, "http://127.0.0.1:1", "small-3").settings()
+    assert growing == {"pose model": "small-3", "pose recording": "one.jsonl"}
+    assert "SmolLM2" in PoseSource().settings()["pose model"]
+
+
+def test_conditions_name_the_tasks_and_the_model_of_the_poses() -> None:
+    tasks = [SourceText("new", UNICORN, "embomatrix", scene="Rs_int")]
+    evaluation, _ = evaluate_scenes(tasks, [LayoutMethod.TREE], 0, 1)
+    assert evaluation.conditions.items() >= {**task_list_settings(tasks), **PoseSource().settings()}.items()
+
+
+@pytest.mark.parametrize("source", ["behavior-1k", "embomatrix"])
+def test_oracle_is_held_to_the_same_limit_as_an_import(source: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = []
+    monkeypatch.setattr(scenes, "SceneView", lambda _: None)
+    monkeypatch.setattr(scenes, "poses_for", lambda *_: PoseCache())
+    monkeypatch.setattr(scenes, "load_simulator", lambda _: contextlib.nullcontext())
+    monkeypatch.setattr(scenes.contextlib, "closing", lambda each: each)
+    monkeypatch.setattr(scenes, "out_of_hand", lambda *_: ())
+    monkeypatch.setattr(scenes, "admit", lambda *_, most_held: limits.append(most_held))
+    task = SimpleNamespace(source=source)
+    scenes._executed(SimpleNamespace(scene=None, task=task, init=(), about=()), None, 0)
+    assert limits == [max_held_share(task)]
+    assert limits == [1.0 if source == "behavior-1k" else MAX_HELD_SHARE]
 
 
 def test_packaged_recording_has_every_pose_of_a_fixed_task() -> None:

@@ -20,6 +20,7 @@ from embomatrix.factory.task_import.dialects import (
 )
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
+    ImportScope,
     ProblemOutcome,
     evaluation_of,
     outcome_of,
@@ -184,6 +185,25 @@ def test_report_counts_refusals_and_lists_unreachable_goals(eai: Path, flat: Sce
     assert (rate.value, rate.goal, rate.n) == (0.5, 1.0, 2)
 
 
+def test_only_rates_of_all_problems_have_goals_and_conditions_name_filters() -> None:
+    bound = ProblemOutcome("a", "behavior-1k", "", "", "", {"paper": (), "household": ()}, (), (), True)
+    names = ("import_rate_behavior", "faithful_share_behavior")
+    whole = evaluation_of([bound], 3, ImportScope("instantiate", ("Rs_int", "Merom_0_int")))
+    assert whole.conditions == {"seed": 3, "depth": "instantiate", "base scenes": "Rs_int, Merom_0_int"}
+    assert [whole.figure(name).goal for name in names] == [0.6, 0.6]
+    five = ("Rs_int",) * 5
+    paper = evaluation_of([bound], 0, ImportScope("instantiate", five, Profile.PAPER, solids=True))
+    assert paper.conditions["base scenes"] == 5
+    assert paper.conditions["problems"] == "reached by paper and without liquids"
+    for scope in (ImportScope("instantiate", five, Profile.PAPER), ImportScope("bind", five)):
+        assert [evaluation_of([bound], 0, scope).figure(name).goal for name in names] == [None, None]
+    solved = solved_of([bound], 0, ImportScope("verify", five, Profile.PAPER))
+    assert [(figure.name, figure.goal) for figure in solved.figures] == [
+        ("oracle_solved_behavior of what paper reaches", 0.95)
+    ]
+    assert solved.conditions["problems"] == "reached by paper"
+
+
 def test_solved_share_counts_reachable_goals_only() -> None:
     solved, stuck, beyond = (
         ProblemOutcome(name, "behavior-1k", "", reason, "", {"paper": atoms, "household": ()}, ())
@@ -191,7 +211,7 @@ def test_solved_share_counts_reachable_goals_only() -> None:
     )
     evaluation = solved_of([solved, stuck, beyond], 0)
     summary = [(figure.name, figure.value, figure.goal, figure.n) for figure in evaluation.figures]
-    without = solved_of([solved], 0, solids=True).figures[0].name
+    without = solved_of([solved], 0, ImportScope(solids=True)).figures[0].name
     assert without == "oracle_solved_behavior of what paper reaches without liquids"
     assert summary == [
         ("oracle_solved_behavior of what paper reaches", 1 / 2, 0.95, 2),

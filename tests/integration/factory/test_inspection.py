@@ -133,6 +133,28 @@ def test_scene_pictures_are_rendered_once(dataset, tmp_path):
     assert (wrong.exit_code, "there is no dataset" in " ".join(wrong.output.split())) == (2, True)
 
 
+@pytest.mark.parametrize(
+    ("source", "licence", "origin"),
+    [
+        ("society", "license: mit", "they are unknown."),
+        ("writer", "license: mit", "they are unknown."),
+        ("behavior-1k", "license: mit", "these tasks were imported."),
+        ("eai", "license: other", "these tasks were imported."),
+        ("file", "license: other", "these tasks were imported."),
+    ],
+)
+def test_card_of_a_folder_without_settings_tells_the_origin_by_the_sources(
+    dataset, tmp_path, source, licence, origin
+):
+    records = tuple(
+        dataclasses.replace(each, task=dataclasses.replace(each.task, source=source))
+        for each in dataset.records
+    )
+    card = dataset_card(Dataset(tmp_path, records), "t.jsonl", b"")
+    assert licence in card.splitlines()
+    assert f"The folder holds no build settings: {origin}" in card
+
+
 def test_export_replaces_its_own_files_but_no_others(dataset, tmp_path):
     def export(*options):
         return CliRunner().invoke(

@@ -1,7 +1,10 @@
 """Lies of a language model are refused, honest requests are admitted, in whatever words."""
 
+from dataclasses import replace
+
 import pytest
 
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.evaluate.lies import (
     GOAL_CALLS,
     GOAL_TOKENS,
@@ -9,6 +12,8 @@ from embomatrix.factory.evaluate.lies import (
     ScriptedModel,
     ScriptedRequest,
     evaluate_lies,
+    is_refused,
+    outcomes_of,
     written_by,
 )
 from embomatrix.factory.social.model.agents import READING, SUMMARY
@@ -16,7 +21,7 @@ from embomatrix.factory.social.rules.demands import differences
 from embomatrix.factory.social.rules.faults import FaultKind
 from embomatrix.factory.social.scene_kinds import SceneKinds
 from embomatrix.llm.ledger import Ledger
-from embomatrix.llm.values import ChatRequest, Reply
+from embomatrix.llm.values import ChatRequest, Reply, UnusableReplyError
 
 TABLE = LieTable.load()
 LIES = {lie.name: lie for lie in TABLE.lies}
@@ -36,6 +41,34 @@ def test_all_lies_are_refused_and_all_honest_requests_admitted_at_half_the_cost(
     assert found.figure("honest_admitted").n >= 5
     assert 1.0 < found.figure("calls_per_task").value <= GOAL_CALLS
     assert 500 < found.figure("tokens_per_task").value <= GOAL_TOKENS
+
+
+def test_failure_of_the_writer_is_no_refusal_of_a_lie(scene: SceneKinds) -> None:
+    unfaithful = TaskRefusal(RefusalReason.UNFAITHFUL, "another place")
+    unusable = TaskRefusal(RefusalReason.UNUSABLE_ANSWER, "no JSON")
+    assert is_refused([unfaithful])
+    assert is_refused([unusable, unfaithful])
+    assert not is_refused([unusable])
+    assert not is_refused([])
+    assert not is_refused(outcomes_of(_Mute(TABLE.people, [LIES["polarity"]]), scene))
+
+
+class _Mute(ScriptedModel):
+    """Model that gives no summary of a dialogue."""
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        if request.purpose == SUMMARY:
+            raise UnusableReplyError("no summary")
+        return await super().complete(request)
+
+
+def test_lies_without_a_verdict_are_named_beside_the_refused_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = replace(TABLE, lies=(LIES["polarity"],))
+    monkeypatch.setattr(LieTable, "load", lambda: table)
+    monkeypatch.setattr("embomatrix.factory.evaluate.lies.ScriptedModel", _Mute)
+    found = evaluate_lies()
+    assert found.figure("lies_refused").value == 0.0
+    assert found.notes == ("Lies without a verdict, since the writer got no usable answer: polarity.",)
 
 
 @pytest.mark.parametrize("name", LIES)

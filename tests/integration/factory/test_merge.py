@@ -12,6 +12,7 @@ from embomatrix.factory.commands.app import app
 from embomatrix.factory.pipeline.export import dataset_card
 from embomatrix.factory.pipeline.merge import ConflictKind, Resolution, merge_datasets
 from embomatrix.world.dataset import Dataset, DatasetError, write_dataset
+from embomatrix.world.difficulty import Difficulty
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,16 @@ def test_exact_duplicates_are_dropped(kitchen, tmp_path):
     first, again = (write(tmp_path / name / "a", kitchen) for name in ("x", "y"))
     done = merge_datasets([first, again], tmp_path / "out")
     assert (len(done.records), done.duplicates) == (4, 4)
+
+
+def test_measured_difficulty_of_one_of_two_copies_is_kept(kitchen, tmp_path):
+    measured = Difficulty(True, True, True, 4, None)
+    plain = write(tmp_path / "x" / "a", kitchen)
+    other = write(tmp_path / "y" / "a", kitchen, difficulty=measured)
+    for number, folders in enumerate(([plain, other], [other, plain])):
+        done = merge_datasets(folders, tmp_path / f"out-{number}")
+        assert (len(done.records), done.duplicates) == (4, 4)
+        assert {record.difficulty for record in done.records} == {measured}
 
 
 def test_one_id_for_two_tasks_is_refused(kitchen, tmp_path):

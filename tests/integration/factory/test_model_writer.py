@@ -189,6 +189,27 @@ def test_lies_without_end_are_refused_a_bounded_number_of_times() -> None:
     assert reasons == {RefusalReason.UNFAITHFUL}
 
 
+class _Unreachable(ScriptedModel):
+    """Model that can't be reached when it is asked to correct a request."""
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        if request.purpose == SUMMARY and len(request.messages) > 2:
+            raise EndpointError("no answer to the objection")
+        return await super().complete(request)
+
+
+def test_good_requests_stay_when_the_correction_of_others_fails() -> None:
+    lie = next(each for each in TABLE.lies if each.name == "polarity")
+    found = written(_Unreachable(TABLE.people, [HONEST["book"], lie]))
+    assert [each.instruction for each in found if isinstance(each, WrittenRequest)] == [
+        HONEST["book"].instruction
+    ]
+    assert [each.reason for each in found if isinstance(each, TaskRefusal)] == [
+        RefusalReason.UNFAITHFUL,
+        RefusalReason.NO_ANSWER,
+    ]
+
+
 def test_dead_endpoint_ends_the_writing() -> None:
     server = ChatServer((500, {}, "broken", 0.0))
     limits = EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
@@ -284,6 +305,25 @@ def planned(*requests: ScriptedRequest) -> PlannedDay | TaskRefusal:
     order = VariantOrder("train", 0, BASE.base, rooms, dict.fromkeys(TaskCategory, 1), frozenset())
     with ModelWriter(SocialModelAgents(ScriptedModel(TABLE.people, list(requests)))) as writer:
         return ModelDays(writer).plan(order, BASE, 0)
+
+
+def test_day_of_a_model_knows_the_earlier_tasks_of_its_own_home_in_their_order() -> None:
+    rooms = tuple(room.name for room in BASE.rooms)
+    order = VariantOrder(
+        "train",
+        1,
+        BASE.base,
+        rooms,
+        dict.fromkeys(TaskCategory, 1),
+        frozenset({"inside(egg,bowl)|Put the egg in the bowl of another home."}),
+        told=("Please tidy up.", "Fetch an apple."),
+    )
+    model = scripted("book")
+    with ModelWriter(SocialModelAgents(model)) as writer:
+        ModelDays(writer).plan(order, BASE, 0)
+    day = prompts(model, DAY)[0]
+    assert "- Please tidy up.\n- Fetch an apple." in day
+    assert "another home" not in day
 
 
 def wish_for(kind: str, count: int = 1) -> Wish:

@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,16 +11,20 @@ from tests.fakes.plans import plan_of, task_over
 from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
+from embomatrix.factory.evaluate.faithfulness import PolicyAnswers, audit_dataset
 from embomatrix.factory.evaluate.skills import (
     UNNEEDED,
     NeededSkills,
     evaluate_skills,
+    needed_in_dataset,
     needed_skills,
 )
+from embomatrix.factory.evaluate.verification import Judgement, verify_again
 from embomatrix.factory.metrics.figures import EvaluationError, read_evaluation
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.syntax import PlaceRelation, Skill
 from embomatrix.world.bundle import Bundle
+from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.goal import And, Atom
 from embomatrix.world.task import Profile
 
@@ -103,6 +108,25 @@ def test_dataset_without_tasks_is_reported_in_a_sentence():
 def test_docs_list_every_skill_that_no_goal_needs_with_its_reason():
     rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", DOCS.read_text(encoding="utf-8"), re.MULTILINE))
     assert {skill: rows.get(skill) for skill in UNNEEDED} == dict(UNNEEDED)
+
+
+@pytest.mark.parametrize(
+    "measure",
+    [
+        lambda folder, records: needed_in_dataset(folder, records, 1),
+        lambda folder, records: audit_dataset(folder, records, plans=1, answers=PolicyAnswers(), jobs=1),
+        lambda folder, records: verify_again(folder, records, physical=False, jobs=1),
+    ],
+)
+def test_records_are_not_read_again_and_unreadable_plans_are_named(tmp_path, measure):
+    dataset = Dataset.load(write_kitchen_dataset(tmp_path))
+    (tmp_path / "tasks.jsonl").write_text("damaged")
+    assert len(measure(tmp_path, dataset.records[:1])) == 1
+    if measure(tmp_path, dataset.records[:1])[0].__class__ is Judgement:
+        return  # it executes no stored plan
+    broken = replace(dataset.records[0], oracle=({"skill": "juggle"},))
+    with pytest.raises(DatasetError, match=r"the oracle plan of task .* can't be read"):
+        measure(tmp_path, [broken])
 
 
 def test_command_measures_a_dataset(tmp_path):

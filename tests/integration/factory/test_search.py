@@ -1,5 +1,6 @@
 """Searches: tasks whose first look lacks something, found by a script that knows only what the robot has seen."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -7,12 +8,19 @@ from tests.fakes.datasets import write_kitchen_dataset
 from typer.testing import CliRunner
 
 from embomatrix.factory.commands.app import app
-from embomatrix.factory.evaluate.search import evaluate_search, search_tasks, searches
+from embomatrix.factory.evaluate.search import (
+    SearchResult,
+    evaluate_search,
+    evaluation_of,
+    search_tasks,
+    searches,
+)
+from embomatrix.factory.pipeline.selection import write_selection
 from embomatrix.scripts.searching import PlacePriors, SearchingScript, room_kind
 from embomatrix.skills.prompt import PromptRow, Situation
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
-from embomatrix.world.dataset import Dataset
+from embomatrix.world.dataset import Dataset, bundle_file
 from embomatrix.world.state import Relation
 
 
@@ -46,6 +54,40 @@ def test_figures_are_of_the_held_out_tasks(kitchen):
     oracle, blind = found.figure("search_oracle_success"), found.figure("search_blind_success")
     assert (oracle.value, oracle.n) == (1.0, len(kitchen.heldout))
     assert 0 <= blind.value <= 1
+
+
+def test_only_the_success_of_searches_has_a_goal():
+    easy, hidden, lost = SearchResult(0, True, 4), SearchResult(1, True, 9), SearchResult(2, False, 20)
+    found = evaluation_of({"a": easy, "b": easy, "c": hidden, "d": lost}, {})
+    every, of_searches = (
+        found.figure(name) for name in ("search_oracle_success", "search_oracle_success of searches")
+    )
+    assert (every.value, every.n, every.goal) == (0.75, 4, None)
+    assert (of_searches.value, of_searches.n, of_searches.goal) == (0.5, 2, 0.95)
+    assert len(evaluation_of({"a": easy}, {}).figures) == 2, "nothing to search for"
+
+
+def test_selection_replaces_all_files_of_an_older_one_and_keeps_transcripts(kitchen, tmp_path):
+    source = Dataset.load(shutil.copytree(kitchen.folder, tmp_path / "source"))
+    first, second = source.records[:2]
+    for name, suffix in (("transcripts", "md"), ("trees", "json")):
+        (source.folder / name).mkdir()
+        for record in (first, second):
+            (source.folder / name / f"{record.task.task_id}.{suffix}").write_text("{}")
+    out = tmp_path / "out"
+    write_selection(out, source, [first])
+    (out / "bundles" / f"{'0' * 64}.bundle").touch()
+    for name in ("build.jsonl", "attempts.jsonl", "times.jsonl", "merged.json", "notes.txt"):
+        (out / name).touch()
+    write_selection(out, source, [second])
+    assert Dataset.load(out).records == (second,)
+    assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()) == [
+        f"bundles/{bundle_file(second.bundle_digest)}",
+        "notes.txt",
+        "tasks.jsonl",
+        f"transcripts/{second.task.task_id}.md",
+        f"trees/{second.task.task_id}.json",
+    ]
 
 
 class _Counter:

@@ -10,7 +10,7 @@ from embomatrix.factory.faithfulness.monitor import watch
 from embomatrix.factory.faithfulness.shortcuts import PlanOrigin, find_shortcuts, shortcut_in_words
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.goal import Atom
+from embomatrix.world.goal import And, Atom
 from embomatrix.world.intent import IntentClause
 from embomatrix.world.state import State
 
@@ -37,6 +37,30 @@ def flat():
 
 def task_of(simulator, *atom):
     return task_over(simulator.world.scene, Atom(atom[0], atom[1:]))
+
+
+def test_greedy_search_goes_on_from_a_first_subgoal_that_was_tried_before(flat):
+    laid, hot = Atom("ontop", ("bowl_1", "breakfast_table_1")), Atom("hot", ("apple_1",))
+    task = task_over(flat.world.scene, And((laid, hot)))
+    first = plan_of(
+        task, "move bowl_1; pick_up bowl_1; move breakfast_table_1; place breakfast_table_1 ontop"
+    )
+    found = find_shortcuts(flat, task, WITH_THE_MICROWAVE, (), 1000, [first])
+    longer = (*first, *plan_of(task, ON_THE_RUNNING_STOVE))
+    assert (PlanOrigin.GREEDY, longer) in [(each.origin, each.plan) for each in found.shortcuts]
+    assert found.tried[PlanOrigin.GIVEN] == 1
+    assert found.tried.total() <= 1000
+
+
+def test_equal_swaps_are_executed_once(flat, monkeypatch):
+    task = task_of(flat, "inside", "apple_1", "cabinet_1")
+    resets = []
+    reset = flat.reset
+    monkeypatch.setattr(flat, "reset", lambda *given: resets.append(given) or reset(*given))
+    plans = 4
+    find_shortcuts(flat, task, (), plan_of(task, "move apple_1"), plans)
+    # Each plan is stripped of its failing calls and then watched; the greedy search looks at the scene once more.
+    assert len(resets) <= 2 * plans + 1
 
 
 def test_goal_without_its_source_is_reached_by_another_one(flat):

@@ -17,6 +17,8 @@ from embomatrix.factory.pipeline.corpus import (
     TASKS,
     check_free,
     freeze_hardest,
+    holds_build_of,
+    is_finished,
     join_parts,
     joined_part,
     part_folder,
@@ -50,8 +52,8 @@ def corpus(
     proofs: Annotated[
         Path | None,
         typer.Option(
-            help="Dataset, as a folder or packed, whose tasks are proved already: tasks that differ from them only in words "
-            "are not proved again, and keep their poses and plans."
+            help="Build with the same settings, as a folder or packed, whose tasks are proved already: tasks that differ from "
+            "them only in words are not proved again, and keep their poses and plans."
         ),
     ] = None,
     frozen: Annotated[
@@ -81,18 +83,18 @@ def corpus(
         _check_held_out(together, chosen, "--freeze")
         keep_foreign("factory corpus", [frozen], FROZEN_MARK, force=force)
         prepare_output("factory corpus", frozen)
-    making = DAYS if proofs is None else _with_proofs(proofs)
+    making = DAYS if proofs is None else _with_proofs(proofs, chosen[0])  # all parts have one way of proof
     with user_errors(packed):
         if packed is not None:
             packed.mkdir(parents=True, exist_ok=True)
     with user_errors(out):
         check_free(out)
         built = [number for number in chosen if check or packed is not None or number not in shipped]
-        for number in together:
-            if number in built:
-                _build(part_folder(out, number), number, jobs, making)
-            else:
+        for number in together:  # before the builds, which take hours
+            if number not in built:
                 _unpack(part_folder(out, number), number)
+        for number in built:
+            _build(part_folder(out, number), number, jobs, making)
         joined = join_parts(out, together)
         tasks = Dataset.load(out / TASKS)
         say(
@@ -112,12 +114,12 @@ def corpus(
             say(f"Internal-Verified 2: {count} tasks, {freeze_hardest(records, count, frozen).digest}")
 
 
-def _with_proofs(proofs: Path) -> Making:
-    """Return the making of days with these proofs. Exit if they can't be read."""
+def _with_proofs(proofs: Path, number: int) -> Making:
+    """Return the making of days with these proofs for a part. Exit if they can't be read, or if its settings differ."""
     try:
-        return days_with_proofs(proofs)
+        return days_with_proofs(proofs, settings_of(PARTS[number]))
     except (DatasetError, OSError) as error:
-        fail(f"name a dataset's folder or a packed part with --proofs: {error}")
+        fail(f"name the folder of a build or a packed part with --proofs: {error}")
 
 
 def _check_parts(chosen: Sequence[int], shipped: Sequence[int], *, check: bool) -> None:
@@ -157,8 +159,16 @@ def _build(folder: Path, number: int, jobs: int | None, making: Making) -> None:
 
 
 def _unpack(folder: Path, number: int) -> None:
-    """Unpack a part, unless the folder holds a build of it. Raises DatasetError if it holds another dataset."""
-    if (folder / BUILD_FILE).exists():
+    """Unpack a part, unless the folder holds a finished build of it. Raises DatasetError if it holds another dataset.
+
+    The part is unpacked beside the log of an interrupted build, which a later call with --check can still resume.
+    """
+    if is_finished(folder):
+        if not holds_build_of(folder, archive_of(number)):
+            raise DatasetError(
+                f"{folder} holds a build that differs from part {number} as it ships: name another folder with --out, remove "
+                f"this one to unpack the part, or add --part {number} to a call with --packed to use the build"
+            )
         return
     if (folder / TASKS_FILE).exists() and not holds_shipped(folder, [number]):
         raise DatasetError(

@@ -17,10 +17,11 @@ from embomatrix.factory.evaluate.difficulty import (
     with_scripts,
 )
 from embomatrix.factory.evaluate.scripts import ScriptResults, run_scripts, write_plans
+from embomatrix.factory.pipeline.selection import write_selection
 from embomatrix.host.own_files import Force
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetFolder
 from embomatrix.starter.shipped import open_dataset
-from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, TaskRecord, encode_records, write_dataset
+from embomatrix.world.dataset import SPLITS, TASKS_FILE, Dataset, TaskRecord, encode_records
 from embomatrix.world.difficulty import DifficultyLevel
 from embomatrix.world.whole_file import write_whole
 
@@ -74,8 +75,7 @@ def difficulty(
         _print_levels(records)
         if out is not None:
             chosen = selected(records, shares, (split,) if split else SPLITS)
-            digests = dict.fromkeys(record.bundle_digest for record in chosen)
-            write_dataset(out, chosen, {digest: found.bundle_bytes(digest) for digest in digests})
+            write_selection(out, found, chosen)
             _print_levels(chosen)
             say(f"{len(chosen)} of {len(records)} tasks: {out}")
 

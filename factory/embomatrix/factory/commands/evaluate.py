@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from embomatrix.factory.commands.language_model import MODEL_ERRORS, Key, Llm, Model, Tape, chat_model
@@ -18,7 +17,7 @@ from embomatrix.factory.commands.options import ScriptsLearnFrom, Seed
 from embomatrix.factory.commands.terminal import counter, report_evaluation, say, user_errors
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics_fit import evaluate_aesthetics
-from embomatrix.factory.evaluate.judges import evaluate_looks, judged
+from embomatrix.factory.evaluate.judges import evaluate_looks, with_judge
 from embomatrix.factory.evaluate.lies import evaluate_lies
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.readings import evaluate_readings, read_answers, shipped_answers
@@ -29,6 +28,7 @@ from embomatrix.factory.evaluate.scenes import (
     evaluate_scenes,
     fixed_tasks,
     outcome_log,
+    task_list_settings,
 )
 from embomatrix.factory.evaluate.scripts import evaluate_scripts
 from embomatrix.factory.evaluate.search import evaluate_search
@@ -46,14 +46,12 @@ from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.host.code_version import commit_here
 from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.llm.values import ChatModel
-from embomatrix.pages.figures import Better, Figure
 from embomatrix.starter.shipped import unpack
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
 
 METHODS = list(LayoutMethod)
-JUDGED = ("variety", "characters", "overall")
 Judge = AbstractAsyncContextManager[ChatModel]
 
 
@@ -211,7 +209,7 @@ def _tasks(dataset: Path | None, each: int, seed: int, judge: Judge | None) -> E
             groups, evaluation = evaluate_tasks(chosen, each, seed, count)
     if judge is None:
         return evaluation
-    return replace(evaluation, figures=(*evaluation.figures, *asyncio.run(_judged(judge, groups, seed))))
+    return asyncio.run(_judged(judge, groups, seed, evaluation))
 
 
 def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[DraftFeatures]], EvaluationFigures]:
@@ -223,17 +221,16 @@ def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[DraftFea
     return groups, EvaluationFigures("tasks", conditions, figures)
 
 
-async def _judged(judge: Judge, groups: Mapping[str, Sequence[DraftFeatures]], seed: int) -> list[Figure]:
-    """Return the mean scores of a language model over the scenes."""
+async def _judged(
+    judge: Judge,
+    groups: Mapping[str, Sequence[DraftFeatures]],
+    seed: int,
+    evaluation: EvaluationFigures,
+) -> EvaluationFigures:
+    """Return the evaluation with the mean scores of a language model over the scenes."""
     async with judge as model:
-        verdicts = [
-            await judged(model, [asked.instruction for asked in group], seed) for group in groups.values()
-        ]
-    means = np.mean([[getattr(verdict, name) for name in JUDGED] for verdict in verdicts], axis=0)
-    return [
-        Figure(f"judge {name}", float(mean), "of 10", Better.NEITHER, len(verdicts))
-        for name, mean in zip(JUDGED, means, strict=True)
-    ]
+        told = ([asked.instruction for asked in group] for group in groups.values())
+        return await with_judge(evaluation, model, told, seed)
 
 
 def _scenes(
@@ -247,7 +244,7 @@ def _scenes(
     """Measure generation rate, verification pass rate and time by three methods."""
     kept = "; outcomes so far are saved: run the same command to resume" if outcomes is not None else ""
     with user_errors(outcomes, kept):
-        log = outcome_log(outcomes, seed)
+        log = outcome_log(outcomes, seed, {**task_list_settings(tasks), **poses.settings()})
         with counter("trials", len(tasks) * len(METHODS)) as count:
             evaluation, _ = evaluate_scenes(tasks, METHODS, seed, jobs, count, log, poses)
     taken = {"taken": f"one in {only} of the fixed tasks"} if only > 1 else {}

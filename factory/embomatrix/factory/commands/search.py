@@ -9,10 +9,11 @@ import typer
 from embomatrix.factory.commands.options import Jobs, PlacesLearnedFrom, processes
 from embomatrix.factory.commands.terminal import counter, fail, say, show_table, user_errors
 from embomatrix.factory.evaluate.search import search_tasks, searches
+from embomatrix.factory.pipeline.selection import write_selection
 from embomatrix.host.own_files import Force, keep_foreign, prepare_output
 from embomatrix.starter.options import DEFAULT_DATASET, DatasetOrName
 from embomatrix.starter.shipped import FROZEN_MARK, freeze, open_dataset
-from embomatrix.world.dataset import SPLITS, TASKS_FILE, write_dataset
+from embomatrix.world.dataset import SPLITS, TASKS_FILE
 from embomatrix.world.task import TaskCategory
 
 
@@ -50,8 +51,7 @@ def search(
         with counter("tasks", len(records)) as count:
             results = search_tasks(found, records, learned, jobs=processes(jobs), progress=count)
         chosen = searches(records, results)
-        digests = dict.fromkeys(record.bundle_digest for record in chosen)
-        write_dataset(out, chosen, {digest: found.bundle_bytes(digest) for digest in digests})
+        write_selection(out, found, chosen)
         if frozen is not None:
             say(f"frozen: {len(chosen)} tasks, {freeze(chosen, frozen).digest}")
     hidden = sum(result.is_search for result in results.values())

@@ -22,6 +22,7 @@ from embomatrix.factory.task_import.importer import Depth, ImportSettings, impor
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     REPORT_MARK,
+    ImportScope,
     ProblemOutcome,
     changed_problems,
     evaluation_of,
@@ -114,9 +115,8 @@ def import_(
         admitted = out is None or _written(out, made, settings.scenes.own)
         all_outcomes = log.outcomes
         verified = depth is Depth.VERIFY
-        evaluation = (
-            solved_of(all_outcomes, seed, solids=solids) if verified else evaluation_of(all_outcomes, seed)
-        )
+        scope = ImportScope(depth.value, tuple(settings.scenes.names), reached_by, solids)
+        evaluation = (solved_of if verified else evaluation_of)(all_outcomes, seed, scope)
         _write(all_outcomes, evaluation, report, json_file)
     if len(sources) == len(made) == 1:
         _print_one(sources[0], made[0])

@@ -290,11 +290,12 @@ def _without(condition: Condition, suffix: str) -> Condition:
 
 
 def _renamed(condition: Condition, labels: Mapping[str, str]) -> Condition:
-    """Return the condition with other labels, and its alternative too."""
+    """Return the condition with other labels, and its alternative and its premise too."""
     return condition.model_copy(
         update={
             "things": labels[condition.things],
             "place": labels.get(condition.place, ""),
             "otherwise": condition.otherwise and _renamed(condition.otherwise, labels),
+            "provided": condition.provided and _renamed(condition.provided, labels),
         }
     )

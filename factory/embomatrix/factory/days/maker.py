@@ -69,10 +69,10 @@ class DayMaker:
         own: Mapping[str, Scene] = MappingProxyType({}),
         proofs: Path | None = None,
     ) -> None:
-        """Raise DatasetError if ``proofs`` holds no dataset."""
+        """Raise DatasetError if ``proofs`` holds no build with the same settings of proof."""
         self._settings = settings
         self._plan = plan
-        self._proofs = None if proofs is None else DayProofs(proofs)
+        self._proofs = None if proofs is None else _proofs_in(proofs, settings)
         self._library = PlacementLibrary()
         self._foresight = ReachabilitySurvey() if settings.reachability else None
         self._bases: dict[str, Scene] = dict(own)
@@ -107,12 +107,19 @@ DAYS: Final = Making(
 """Making of days in whole scenes."""
 
 
-def days_with_proofs(path: Path) -> Making:
+def _proofs_in(path: Path, settings: BuildSettings) -> DayProofs:
+    """Read an earlier build. Raise DatasetError if it has other settings of proof."""
+    proofs = DayProofs(path)
+    proofs.check(settings)
+    return proofs
+
+
+def days_with_proofs(path: Path, settings: BuildSettings) -> Making:
     """Return the making of days with the proofs of an earlier build: tasks that differ only in words are not proved again.
 
-    Raise DatasetError if there is no dataset, here rather than in a process of the build.
+    Raise DatasetError if there is no build with the same settings of proof, here rather than in a process of the build.
     """
-    DayProofs(path)
+    _proofs_in(path, settings)
     return replace(DAYS, begin=partial(DayMaker, proofs=path))
 
 

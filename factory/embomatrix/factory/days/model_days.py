@@ -39,7 +39,7 @@ TOOLS: Final = (
 
 
 class ModelDays:
-    """Planner of days on a language model. Earlier instructions of a build are in the model's view."""
+    """Planner of days on a language model. Earlier instructions of the same home are in the model's view."""
 
     def __init__(self, writer: ModelWriter, agents: LayoutAgents | None = None) -> None:
         self._writer = writer
@@ -49,9 +49,8 @@ class ModelDays:
         """Return a day of requests with the refusals on the way. Raise LlmError after several answers without use."""
         key = (seed, zlib.crc32(order.split.encode()), zlib.crc32(order.base.encode()), order.number)
         rng = np.random.default_rng(np.random.SeedSequence(key))
-        earlier = sorted(text.partition("|")[2] for text in order.known)
         written = self._writer.write(
-            kinds_of(SceneView(base)), REQUESTS_OF_DAY, int(rng.integers(SEEDS)), earlier
+            kinds_of(SceneView(base)), REQUESTS_OF_DAY, int(rng.integers(SEEDS)), order.told
         )
         refusals = [each for each in written if isinstance(each, TaskRefusal)]
         requests = _of_different_things([each for each in written if isinstance(each, WrittenRequest)])

@@ -6,11 +6,19 @@ Poses and the proof in physics take 95 % of the CPU time of a day's build, and d
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Final
 
 from embomatrix.factory.days.planning import PlannedDay
-from embomatrix.factory.pipeline.store import VariantResult, VariantYield
+from embomatrix.factory.pipeline.settings import BuildSettings
+from embomatrix.factory.pipeline.store import (
+    Rejection,
+    VariantResult,
+    VariantYield,
+    build_results,
+    build_settings,
+)
 from embomatrix.factory.pipeline.variants import VariantOrder
 from embomatrix.starter.archive import read_packed
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
@@ -19,24 +27,49 @@ from embomatrix.world.inflation import BundleError, bundle_digest
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Task
 
+PROVING: Final = ("physical", "reachability", "shortcut_plans")
+"""Settings of a build that decide which drafts it admits."""
+
 
 class DayProofs:
     """Days of an earlier build, by the names of their scenes."""
 
     _bundle: Callable[[str], Bundle]
+    _settings: Mapping[str, Any]
 
     def __init__(self, path: Path) -> None:
-        """Read the records of a dataset, or of a packed one. Raises DatasetError or OSError."""
+        """Read the records of a build, or of a packed one. Raises DatasetError or OSError."""
+        self._path = path
         records: Sequence[TaskRecord]
+        self._refused: dict[str, tuple[Rejection, ...]] = {}
         if path.is_file():
             records, bundles, _ = read_packed(path)
             self._bundle = lambda digest: decode_bundle(bundles[digest])
+            # Only `factory corpus` packs, and its recipes prove with the default settings. The file lacks the refusals.
+            self._settings = dataclasses.asdict(BuildSettings())
         else:
             dataset = Dataset.load(path)
             records, self._bundle = dataset.records, dataset.read_bundle
+            self._settings = build_settings(path)
+            # The records name the scene that was laid out, the refusals only the day.
+            self._refused = {
+                record.task.scene_id: result.rejections
+                for result in build_results(path)
+                for record in result.records
+            }
         self._days: dict[str, list[TaskRecord]] = {}
         for record in records:
             self._days.setdefault(record.task.scene_id, []).append(record)
+
+    def check(self, settings: BuildSettings) -> None:
+        """Raise DatasetError if the tasks were proved under other settings than these."""
+        for name in PROVING:
+            found, expected = self._settings.get(name), getattr(settings, name)
+            if found != expected:
+                raise DatasetError(
+                    f"the tasks of {self._path} were proved with the setting {name} {found}, expected {expected}: name a "
+                    "build with the same settings, or build without proofs"
+                )
 
     def _bundle_of(self, digest: str) -> Bundle:
         try:
@@ -47,8 +80,8 @@ class DayProofs:
     def retold(self, planned: PlannedDay, order: VariantOrder) -> VariantYield | None:
         """Return the earlier day with the words of the planned one; None if more than the words differs.
 
-        Its tasks and their plans are the earlier ones; what was refused then is not tried again. Raises DatasetError for a
-        damaged bundle.
+        Its tasks, their plans and its refusals are the earlier ones; what was refused then is not tried again. Raises
+        DatasetError for a damaged bundle.
         """
         known = self._days.get(planned.scene.scene_id, [])
         drafts = {draft.task.task_id: draft for draft in planned.drafts}
@@ -72,7 +105,16 @@ class DayProofs:
             for record in known
         )
         transcripts = {name: drafts[name].transcript for name in tasks}
-        return VariantYield(VariantResult(order.split, order.number, records, ()), data, transcripts)
+        result = VariantResult(order.split, order.number, records, self._refusals(planned))
+        return VariantYield(result, data, transcripts, retold=True)
+
+    def _refusals(self, planned: PlannedDay) -> tuple[Rejection, ...]:
+        """Return the earlier refusals of the day, as far as they are known, with the words of the planned one."""
+        words = {draft.task.goal_bddl: draft.task.instruction for draft in planned.drafts}
+        return tuple(
+            dataclasses.replace(each, instruction=words.get(each.goal, each.instruction))
+            for each in self._refused.get(planned.scene.scene_id, ())
+        )
 
 
 def _without_words(task: Task) -> Task:

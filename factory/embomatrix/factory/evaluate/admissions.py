@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.settings import WriterKind
-from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, TIMES_FILE, build_settings
+from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, RETOLD, TIMES_FILE, build_settings
 from embomatrix.factory.scenes.build import base_scene_of
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.json_text import parse_json
@@ -22,8 +22,11 @@ LONGEST_S: Final = 1e9
 
 
 def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
-    """Return the admitted share in percent of drafts; empty without a ledger. Raises EvaluationError for a damaged one."""
-    attempts = _attempts(folder)
+    """Return the admitted share in percent of drafts; empty without a ledger. Raises EvaluationError for a damaged one.
+
+    Drafts of variants that an earlier build proved are left out.
+    """
+    attempts = _proved_here(folder, _attempts(folder))
     if not attempts:
         return ()
     share = 100 * sum(each["outcome"] == ADMITTED for each in attempts) / len(attempts)
@@ -40,6 +43,11 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
         raise EvaluationError(
             f"{folder} has no ledger of drafts: expected {ATTEMPTS_FILE}, which `factory build`, `generate` and `corpus` write"
         )
+    everything, attempts = attempts, _proved_here(folder, attempts)
+    if not attempts:
+        raise EvaluationError(
+            f"an earlier build proved all tasks of {folder}: name the folder of a build without proofs with --dataset"
+        )
     settings = build_settings(folder)
     label = WriterKind.PLAIN.value if settings.get("writer") == WriterKind.PLAIN else ""
     figures = (*admitted_share(folder, label), *_per_hour(folder, attempts, label))
@@ -51,14 +59,17 @@ def evaluate_admissions(folder: Path) -> EvaluationFigures:
         "reachability": "yes" if settings.get("reachability") else "no",
         "in physics": "yes" if settings.get("physical") else "no",
     }
-    return EvaluationFigures(
-        "admission", conditions, figures, (f"Rejected drafts{f' of {label}' if label else ''}: {counts}.",)
-    )
+    notes = [f"Rejected drafts{f' of {label}' if label else ''}: {counts}."]
+    if len(attempts) < len(everything):
+        notes.append(
+            f"{len(everything) - len(attempts)} drafts are left out, because an earlier build proved or refused them."
+        )
+    return EvaluationFigures("admission", conditions, figures, tuple(notes))
 
 
 def _per_hour(folder: Path, attempts: Sequence[dict[str, Any]], label: str) -> tuple[Figure, ...]:
     """Return the admitted tasks per hour on two cores, by CPU time. Variants without a recorded time are left out."""
-    lines = list(_times(folder / TIMES_FILE))
+    lines = [line for line in _times(folder / TIMES_FILE) if not line.get(RETOLD)]
     timed = {
         (str(line.get("split")), line["variant"]) for line in lines if isinstance(line.get("variant"), int)
     }
@@ -70,6 +81,16 @@ def _per_hour(folder: Path, attempts: Sequence[dict[str, Any]], label: str) -> t
         return ()
     pace = CORES * 3600 * admitted / spent_s
     return (_figure("admitted_per_hour", label, pace, "tasks", admitted, GOAL_PER_HOUR),)
+
+
+def _proved_here(folder: Path, attempts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the drafts without those of variants that an earlier build proved."""
+    retold = {
+        (str(line.get("split")), line.get("variant"))
+        for line in _times(folder / TIMES_FILE)
+        if line.get(RETOLD) and isinstance(line.get("variant"), int)
+    }
+    return [each for each in attempts if (each["split"], each["variant"]) not in retold]
 
 
 def _times(path: Path) -> Iterator[dict[str, Any]]:

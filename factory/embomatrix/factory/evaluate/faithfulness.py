@@ -2,12 +2,13 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from embomatrix.factory.admission import oracle_plan
+from embomatrix.factory.evaluate.scripts import by_bundle, in_processes
 from embomatrix.factory.faithfulness.instruction import audit, read_intent
 from embomatrix.factory.faithfulness.monitor import PLACED
 from embomatrix.factory.faithfulness.shortcuts import PlanOrigin, find_shortcuts, shortcut_in_words
@@ -15,9 +16,8 @@ from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.scenes.view import SceneView
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
-from embomatrix.skills.parse import PlanError, parse_plan, plan_from_json
+from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, situation_of, with_indices
 from embomatrix.skills.syntax import Plan
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
@@ -66,31 +66,21 @@ def audit_dataset(
 ) -> list[TaskAudit]:
     """Audit records of a dataset, with up to ``plans`` plans for each, and call ``progress`` with the number done so far.
 
-    Raises DatasetError if a bundle can't be read or a process dies.
+    Raises DatasetError if a bundle or a plan can't be read or a process dies.
     """
-    by_bundle: dict[str, list[str]] = {}
-    for record in records:
-        by_bundle.setdefault(record.bundle_digest, []).append(record.task.task_id)
     found: dict[str, TaskAudit] = {}
     work = partial(_audit_bundle, folder, plans=plans, answers=answers)
-    try:
-        with process_pool(jobs) as pool:
-            for group in pool.map(work, by_bundle.items()):
-                found |= {each.task: each for each in group}
-                progress(len(found))
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a process that audits tasks died, perhaps out of memory: run the command again with fewer --jobs"
-        ) from error
+    for group in in_processes(work, by_bundle(records).values(), jobs=jobs, doing="audits tasks"):
+        found |= {each.task: each for each in group}
+        progress(len(found))
     return [found[record.task.task_id] for record in records]
 
 
 def _audit_bundle(
-    folder: Path, tasks: tuple[str, list[str]], *, plans: int, answers: PolicyAnswers
+    folder: Path, records: Sequence[TaskRecord], *, plans: int, answers: PolicyAnswers
 ) -> list[TaskAudit]:
-    """Audit tasks of one bundle. ``tasks`` holds the bundle's digest and the ids of its tasks."""
-    dataset = Dataset.load(folder)
-    bundle = dataset.read_bundle(tasks[0])
+    """Audit tasks of one bundle."""
+    bundle = Dataset(folder, ()).read_bundle(records[0].bundle_digest)
     view = SceneView(bundle.scene)
     with contextlib.closing(load_simulator(bundle)) as simulator:
         return [
@@ -101,17 +91,20 @@ def _audit_bundle(
                 plans,
                 _plans_in(answers, bundle.scene, record.task),
             )
-            for record in map(dataset.find, tasks[1])
+            for record in records
         ]
 
 
 def audit_task(
     simulator: Simulator, view: SceneView, record: TaskRecord, plans: int, given: Sequence[Plan] = ()
 ) -> TaskAudit:
-    """Audit one task. A task whose writer stated no intent is held to its goal and the sources that its words name."""
+    """Audit one task. A task whose writer stated no intent is held to its goal and the sources that its words name.
+
+    Raises DatasetError if the oracle's plan can't be read.
+    """
     task = record.task
     intent = record.intent or read_intent(task, view)
-    oracle = plan_from_json(list(record.oracle), task.profile)
+    oracle = oracle_plan(record)
     report = find_shortcuts(simulator, task, intent, oracle, plans, given)
     return TaskAudit(
         task.task_id,

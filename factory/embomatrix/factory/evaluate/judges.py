@@ -6,7 +6,7 @@ The scores of different models, and those of the geometric score, are not compar
 import asyncio
 import json
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -20,7 +20,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, Lay, import_problem
 from embomatrix.llm.structured import ask
-from embomatrix.llm.values import ChatModel, ChatRequest, Message, Speaker, UnusableReplyError
+from embomatrix.llm.values import ChatModel, ChatRequest, Message, Reply, Speaker, UnusableReplyError
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.scene import Scene
 
@@ -66,6 +66,63 @@ async def judged(model: ChatModel, commands: Sequence[str], seed: int) -> Divers
         seed=seed,
     )
     return await ask(model, request, DiversityScores)
+
+
+class NamedModel:
+    """Chat model that remembers the names of the models that answered."""
+
+    def __init__(self, model: ChatModel) -> None:
+        self._model = model
+        self._names: set[str] = set()
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        """Ask the model and remember its name. Raises LlmError."""
+        reply = await self._model.complete(request)
+        self._names.add(reply.model)
+        return reply
+
+    @property
+    def conditions(self) -> dict[str, str]:
+        """Names of the judges as a condition of measurement; empty without an answer."""
+        return {"judge": ", ".join(sorted(self._names))} if self._names else {}
+
+
+JUDGED: Final = ("variety", "characters", "overall")
+"""Scores of the diversity judge that become figures."""
+
+
+async def with_judge(
+    evaluation: EvaluationFigures, model: ChatModel, groups: Iterable[Sequence[str]], seed: int
+) -> EvaluationFigures:
+    """Return an evaluation of tasks with the mean scores of a judge over the scenes, given the commands of each scene.
+
+    Unusable answers are counted in a note. Raises LlmError if there is no answer at all.
+    """
+    judge = NamedModel(model)
+    verdicts: list[DiversityScores] = []
+    unusable = 0
+    for commands in groups:
+        try:
+            verdicts.append(await judged(judge, commands, seed))
+        except UnusableReplyError:
+            unusable += 1
+    figures = tuple(
+        Figure(
+            f"judge {name}",
+            float(np.mean([getattr(verdict, name) for verdict in verdicts])),
+            "of 10",
+            Better.NEITHER,
+            len(verdicts),
+        )
+        for name in (JUDGED if verdicts else ())
+    )
+    notes = (f"{unusable} scenes got no usable answer of the judge.",) if unusable else ()
+    return EvaluationFigures(
+        evaluation.part,
+        {**evaluation.conditions, **judge.conditions},
+        (*evaluation.figures, *figures),
+        (*evaluation.notes, *notes),
+    )
 
 
 SCENE_JUDGE: Final = "scene judge"
@@ -156,6 +213,7 @@ async def _evaluate_looks(
     seed: int,
     progress: Callable[[int], None],
 ) -> EvaluationFigures:
+    judge = NamedModel(model)
     points: defaultdict[LayoutMethod, list[float]] = defaultdict(list)
     unusable = 0
     for done, task in enumerate(tasks):
@@ -167,7 +225,7 @@ async def _evaluate_looks(
             imported = await asyncio.to_thread(import_problem, task, base, seed=seed, options=options)
             if isinstance(imported, ImportedTask) and laid.names:
                 try:
-                    impression = await impression_of(model, imported.scene, laid.names, seed)
+                    impression = await impression_of(judge, imported.scene, laid.names, seed)
                 except UnusableReplyError:
                     unusable += 1
                 else:
@@ -178,5 +236,5 @@ async def _evaluate_looks(
         for method, found in points.items()
     )
     notes = (f"{unusable} scenes got no usable answer.",) if unusable else ()
-    conditions = {"tasks": len(tasks), "methods": ", ".join(methods), "seed": seed}
+    conditions = {"tasks": len(tasks), "methods": ", ".join(methods), "seed": seed, **judge.conditions}
     return EvaluationFigures("looks", conditions, figures, notes)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any, Final
 
+from embomatrix.factory.admission import RefusalReason, TaskRefusal
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView
@@ -158,14 +159,26 @@ def tokens_in(text: str) -> int:
     return len(_TOKEN.findall(text))
 
 
-def written_by(model: ChatModel, people: SceneKinds, count: int = 1) -> list[WrittenRequest]:
-    """Return the requests that the model writer admits from a model; none if its answers are unusable."""
+def outcomes_of(model: ChatModel, people: SceneKinds, count: int = 1) -> list[WrittenRequest | TaskRefusal]:
+    """Return the requests that the model writer admits from a model, and its refusals. An error is one of them."""
     with ModelWriter(SocialModelAgents(model)) as writer:
         try:
-            found = writer.write(people, count, _SEED)
-        except LlmError:
-            return []
-    return [each for each in found if isinstance(each, WrittenRequest)]
+            return writer.write(people, count, _SEED)
+        except LlmError as error:
+            return [TaskRefusal(RefusalReason.UNUSABLE_ANSWER, str(error))]
+
+
+def written_by(model: ChatModel, people: SceneKinds, count: int = 1) -> list[WrittenRequest]:
+    """Return the requests that the model writer admits from a model; none if its answers are unusable."""
+    return [each for each in outcomes_of(model, people, count) if isinstance(each, WrittenRequest)]
+
+
+def is_refused(outcomes: Sequence[WrittenRequest | TaskRefusal]) -> bool:
+    """True if nothing was admitted because of what the requests say, not because the writer got no usable answer."""
+    refusals = [each for each in outcomes if isinstance(each, TaskRefusal)]
+    return len(refusals) == len(outcomes) and any(
+        each.reason is RefusalReason.UNFAITHFUL for each in refusals
+    )
 
 
 def evaluate_lies() -> EvaluationFigures:
@@ -173,20 +186,29 @@ def evaluate_lies() -> EvaluationFigures:
     table = LieTable.load()
     scene = table.kinds()
 
-    def is_admitted(request: ScriptedRequest) -> bool:
-        return bool(written_by(ScriptedModel(table.people, [request]), scene))
-
-    told = [each for each in table.lies if is_admitted(each)]
+    told: list[str] = []
+    failed: list[str] = []
+    for lie in table.lies:
+        outcomes = outcomes_of(ScriptedModel(table.people, [lie]), scene)
+        if any(isinstance(each, WrittenRequest) for each in outcomes):
+            told.append(lie.name)
+        elif not is_refused(outcomes):
+            failed.append(lie.name)
     ruled = sum(bool(table.faults(each, scene)) for each in table.lies)
-    honest = sum(map(is_admitted, table.honest))
+    honest = sum(bool(written_by(ScriptedModel(table.people, [each]), scene)) for each in table.honest)
     count = len(table.lies)
+    refused = (count - len(told) - len(failed)) / count
     figures = (
-        Figure("lies_refused", 1 - len(told) / count, "", Better.HIGHER, count, 1.0),
+        Figure("lies_refused", refused, "", Better.HIGHER, count, 1.0),
         Figure("lies_refused_by_rules", ruled / count, "", Better.HIGHER, count),
         Figure("honest_admitted", honest / len(table.honest), "", Better.HIGHER, len(table.honest), 1.0),
         *_cost(table, scene),
     )
-    notes = (f"Admitted lies: {', '.join(each.name for each in told)}.",) if told else ()
+    kinds = (
+        ("Admitted lies", told),
+        ("Lies without a verdict, since the writer got no usable answer", failed),
+    )
+    notes = tuple(f"{words}: {', '.join(names)}." for words, names in kinds if names)
     return EvaluationFigures("lies", {"scene": table.scene, "model": "scripted"}, figures, notes)
 
 

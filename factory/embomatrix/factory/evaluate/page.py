@@ -102,7 +102,7 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
     "scenes": (
         "Scenes for tasks",
         "`embomatrix factory evaluate scenes` lays out the same tasks with three methods and checks each scene with code that "
-        "no method uses. *poses* are those that a language model, SmolLM2-135M-Instruct, wrote for the task; *poses_written* "
+        "no method uses. *poses* are those that a language model, the pose model below, wrote for the task; *poses_written* "
         "is the share of tasks for which it wrote a usable pose for every object. *aesthetics* is the score of the added "
         "objects in the tasks that a method laid out, *aesthetics_shared* in the tasks that all methods laid out.",
     ),

@@ -8,6 +8,7 @@ share of tasks that the oracle solves is a separate figure, because it also depe
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import time
@@ -18,6 +19,7 @@ from enum import StrEnum
 from functools import partial
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -35,7 +37,7 @@ from embomatrix.factory.pipeline.store import ResumableLog
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
 from embomatrix.factory.scenes.view import SceneView
-from embomatrix.factory.task_import.batch import poses_for
+from embomatrix.factory.task_import.batch import max_held_share, poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity, read_jsonl
 from embomatrix.factory.task_import.task import ImportedTask, ImportOptions, Lay, import_problem
 from embomatrix.llm.cassette import Cassette
@@ -46,6 +48,7 @@ from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.process_pool import shared_work
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.world.bundle import Bundle
+from embomatrix.world.json_text import parse_json
 from embomatrix.world.scene import Scene
 
 LIST: Final = "scene_tasks.json"
@@ -74,12 +77,31 @@ class PoseSource:
     model: str = ""
     key: str = field(default="", repr=False)
 
+    def settings(self) -> dict[str, str]:
+        """Return the names of model and recording, which decide the poses. Raises OSError.
+
+        A recording is named by its digest; one that an endpoint extends changes with every answer, so its file names it.
+        """
+        if self.url:
+            return {
+                "pose model": self.model,
+                "pose recording": self.recording.name if self.recording is not None else POSES,
+            }
+        with self._file() as path:
+            data = path.read_bytes() if path.is_file() else b""
+        return {"pose model": ", ".join(_models_in(data)), "pose recording": _digest(data)}
+
+    def _file(self) -> contextlib.AbstractContextManager[Path]:
+        """Return the file of the recording."""
+        if self.recording is not None:
+            return contextlib.nullcontext(self.recording)
+        return resources.as_file(resources.files("embomatrix.factory.evaluate") / POSES)
+
     @contextlib.contextmanager
     def methods(self) -> Iterator[Mapping[LayoutMethod, Lay]]:
         """Yield all layout methods. Raises EndpointError or CassetteError."""
-        packaged = resources.as_file(resources.files("embomatrix.factory.evaluate") / POSES)
         endpoint = Endpoint(self.url, self.model, api_key=self.key) if self.url else None
-        with packaged as path, PoseWriter(Cassette(self.recording or path, endpoint), endpoint) as writer:
+        with self._file() as path, PoseWriter(Cassette(path, endpoint), endpoint) as writer:
             yield {
                 LayoutMethod.TREE: lay,
                 LayoutMethod.RANDOM: lay_at_random,
@@ -88,6 +110,27 @@ class PoseSource:
 
 
 PACKAGED_POSES: Final = PoseSource()
+
+
+def _models_in(recording: bytes) -> list[str]:
+    """Return the names of the models whose answers a recording holds. The recording is judged where it is played."""
+    names = set()
+    for line in recording.splitlines():
+        try:
+            names.add(str(parse_json(line)["model"]))
+        except (ValueError, LookupError, TypeError):
+            continue
+    return sorted(names)
+
+
+def _digest(data: bytes) -> str:
+    return f"sha256:{hashlib.sha256(data).hexdigest()[:16]}"
+
+
+def task_list_settings(tasks: Sequence[SourceText]) -> dict[str, str]:
+    """Return the digest of a list of tasks with their scenes."""
+    listed = json.dumps([[task.name, task.scene, task.text] for task in tasks])
+    return {"task list": _digest(listed.encode("utf-8"))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +239,8 @@ def _executed(
     view = SceneView(imported.scene)
     poses = poses_for(imported, view, library, None, seed)
     with contextlib.closing(load_simulator(Bundle(imported.scene, {}, poses))) as simulator:
-        verdict = admit(simulator, imported.task, find_plan, imported.init)
+        most_held = max_held_share(imported.task)
+        verdict = admit(simulator, imported.task, find_plan, imported.init, most_held=most_held)
         lost = out_of_hand(simulator, imported.task, view, imported.about)
     return (verdict if isinstance(verdict, TaskRefusal) else None), lost
 
@@ -283,10 +327,15 @@ def _figures(
 Trial = tuple[SourceText, LayoutMethod]
 
 
-def outcome_log(path: Path | None, seed: int) -> ResumableLog[LayoutOutcome]:
-    """Start or resume the log of trials with one seed; a truncated last line is dropped. Raises DatasetError, OSError."""
+def outcome_log(
+    path: Path | None, seed: int, settings: Mapping[str, str] = MappingProxyType({})
+) -> ResumableLog[LayoutOutcome]:
+    """Start or resume the log of trials with one seed; a truncated last line is dropped. Raises DatasetError, OSError.
+
+    ``settings`` name what else decides the outcomes: the source of poses and the list of tasks.
+    """
     log = ResumableLog[LayoutOutcome](path)
-    log.resume({"seed": seed}, _outcome)
+    log.resume({"seed": seed, **settings}, _outcome)
     return log
 
 
@@ -330,6 +379,8 @@ def evaluate_scenes(
         "base scenes": len({task.scene for task in tasks}),
         "seed": seed,
         "methods": ", ".join(methods),
+        **task_list_settings(tasks),
+        **poses.settings(),
         "time": "CPU seconds of one task from BDDL text to scene, base scene built before, execution after",
     }
     return evaluation_of(outcomes, conditions), outcomes

@@ -2,21 +2,19 @@
 
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from embomatrix.factory.admission import SEED
+from embomatrix.factory.admission import SEED, oracle_plan
+from embomatrix.factory.evaluate.scripts import by_bundle, in_processes
 from embomatrix.factory.metrics.figures import EvaluationError, EvaluationFigures
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
-from embomatrix.skills.parse import plan_from_json
 from embomatrix.skills.syntax import PROFILES, PlaceRelation, Plan, Skill
-from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.dataset import Dataset, TaskRecord
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.task import Profile, Task
 
@@ -55,32 +53,21 @@ def needed_in_dataset(
 ) -> list[NeededSkills]:
     """Return the needs of records of a dataset, and call ``progress`` with the number done so far.
 
-    Raises DatasetError if a bundle can't be read or a process dies.
+    Raises DatasetError if a bundle or a plan can't be read or a process dies.
     """
-    by_bundle: dict[str, list[str]] = {}
-    for record in records:
-        by_bundle.setdefault(record.bundle_digest, []).append(record.task.task_id)
     found: list[NeededSkills] = []
-    try:
-        with process_pool(jobs) as pool:
-            for group in pool.map(partial(_needed_in_bundle, folder), by_bundle.items()):
-                found += group
-                progress(len(found))
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a process that executes plans died, perhaps out of memory: run the command again with fewer --jobs"
-        ) from error
+    work = partial(_needed_in_bundle, folder)
+    for group in in_processes(work, by_bundle(records).values(), jobs=jobs, doing="executes plans"):
+        found += group
+        progress(len(found))
     return found
 
 
-def _needed_in_bundle(folder: Path, tasks: tuple[str, list[str]]) -> list[NeededSkills]:
-    """Return the needs of tasks of one bundle. ``tasks`` holds the bundle's digest and the ids of its tasks."""
-    dataset = Dataset.load(folder)
-    with contextlib.closing(load_simulator(dataset.read_bundle(tasks[0]))) as simulator:
-        return [
-            needed_skills(simulator, record.task, plan_from_json(list(record.oracle), record.task.profile))
-            for record in map(dataset.find, tasks[1])
-        ]
+def _needed_in_bundle(folder: Path, records: Sequence[TaskRecord]) -> list[NeededSkills]:
+    """Return the needs of tasks of one bundle."""
+    bundle = Dataset(folder, ()).read_bundle(records[0].bundle_digest)
+    with contextlib.closing(load_simulator(bundle)) as simulator:
+        return [needed_skills(simulator, record.task, oracle_plan(record)) for record in records]
 
 
 def needed_skills(simulator: Simulator, task: Task, plan: Plan) -> NeededSkills:

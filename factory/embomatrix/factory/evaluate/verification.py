@@ -7,7 +7,6 @@ Optionally a robot also executes the dataset's plan in stepped physics.
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,17 +15,17 @@ from typing import Any, Final
 import numpy as np
 
 from embomatrix.factory.admission import SEED, PlanFailure, TaskRefusal, admit, oracle_plan, plan_failure
+from embomatrix.factory.evaluate.scripts import by_bundle, in_processes
 from embomatrix.factory.metrics.figures import EvaluationFigures
 from embomatrix.factory.task_import.batch import max_held_share
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.planner.oracle import find_plan
-from embomatrix.sim.process_pool import process_pool
 from embomatrix.sim.simulation import load_simulator
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.dataset import Dataset, TaskRecord
 
 SUCCESS: Final = ""
 """Empty sentence of a task without an objection."""
@@ -67,27 +66,19 @@ def verify_again(
 ) -> list[Judgement]:
     """Judge records of a dataset twice and call ``progress`` with the number of judgements so far.
 
-    Raises DatasetError if a bundle can't be read or a process dies.
+    Raises DatasetError if a bundle or a plan can't be read or a process dies.
     """
-    by_bundle: dict[str, list[str]] = {}
-    for record in records:
-        by_bundle.setdefault(record.bundle_digest, []).append(record.task.task_id)
+    groups = by_bundle(records).values()
     found: list[dict[str, Judgement]] = []
     done = 0
     # A new pool for each round: no process of the second round shares state with the first.
     for in_physics in (False, physical):
         judgements: dict[str, Judgement] = {}
         judge = partial(_judge_bundle, folder, physical=in_physics)
-        try:
-            with process_pool(jobs) as pool:
-                for group in pool.map(judge, by_bundle.items()):
-                    judgements |= {each.task: each for each in group}
-                    done += len(group)
-                    progress(done)
-        except BrokenProcessPool as error:
-            raise DatasetError(
-                "a process that verifies tasks died, perhaps out of memory: run the command again with fewer --jobs"
-            ) from error
+        for group in in_processes(judge, groups, jobs=jobs, doing="verifies tasks"):
+            judgements |= {each.task: each for each in group}
+            done += len(group)
+            progress(done)
         found.append(judgements)
     first, second = found
     return [compared(first[task], second[task]) for task in (record.task.task_id for record in records)]
@@ -100,11 +91,9 @@ def compared(first: Judgement, second: Judgement) -> Judgement:
     return replace(second, cached=first.cached or second.cached, agrees=agrees)
 
 
-def _judge_bundle(folder: Path, tasks: tuple[str, list[str]], *, physical: bool) -> list[Judgement]:
-    """Judge tasks of one bundle. ``tasks`` holds the bundle's digest and the ids of its tasks."""
-    dataset = Dataset.load(folder)
-    bundle = dataset.read_bundle(tasks[0])
-    records = [dataset.find(task) for task in tasks[1]]
+def _judge_bundle(folder: Path, records: Sequence[TaskRecord], *, physical: bool) -> list[Judgement]:
+    """Judge tasks of one bundle."""
+    bundle = Dataset(folder, ()).read_bundle(records[0].bundle_digest)
     with contextlib.closing(load_simulator(bundle)) as simulator:
         judgements = [_cached(simulator, record) for record in records]
     if not physical:

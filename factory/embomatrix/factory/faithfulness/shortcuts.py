@@ -107,7 +107,7 @@ def shortcut_in_words(report: SearchReport, table: Sequence[str]) -> str:
 
 
 class _Search:
-    """Search with a limited number of plans. No plan is executed twice."""
+    """Search with a limited number of plans. No plan is executed twice, and only new plans count."""
 
     def __init__(
         self,
@@ -121,7 +121,8 @@ class _Search:
         self._simulator, self._task, self._intent = simulator, task, intent
         self._left = plans
         self._rng = rng
-        self._known: set[Plan] = set()
+        self._known: dict[Plan, WatchedRun] = {}
+        self._succeeding: dict[Plan, Plan] = {}
 
     @property
     def is_over(self) -> bool:
@@ -129,17 +130,20 @@ class _Search:
 
     def without_failures(self, plan: Plan) -> Plan:
         """Return the calls of a plan that succeed one after the other, since another object may need fewer calls."""
-        self._simulator.reset(self._task, SEED)
-        return tuple(call for call in plan if self._simulator.run_step(call).ok)
+        if plan not in self._succeeding:
+            self._simulator.reset(self._task, SEED)
+            self._succeeding[plan] = tuple(call for call in plan if self._simulator.run_step(call).ok)
+        return self._succeeding[plan]
 
     def run(self, origin: PlanOrigin, plan: Plan) -> WatchedRun | None:
-        """Execute a new plan; None if it is known or too long, or no plans are left."""
-        if not 0 < len(plan) <= MAX_STEPS or plan in self._known or self.is_over:
+        """Execute a new plan, or return the run of a known one; None if it is too long, or no plans are left."""
+        if plan in self._known:
+            return self._known[plan]
+        if not 0 < len(plan) <= MAX_STEPS or self.is_over:
             return None
-        self._known.add(plan)
         self._left -= 1
         self.report.tried[origin] += 1
-        found = watch(self._simulator, self._task, self._intent, plan, SEED)
+        found = self._known[plan] = watch(self._simulator, self._task, self._intent, plan, SEED)
         self.report.succeeded += found.reward.success
         if found.is_shortcut:
             self.report.shortcuts.append(Shortcut(origin, plan, found.violated[0]))

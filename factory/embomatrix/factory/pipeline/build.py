@@ -314,7 +314,14 @@ class _SplitOrders:
             made = {result.number for result in self._store.results if result.split == self._split}
             orders = [
                 VariantOrder(
-                    self._split, number, base, self._rooms[base], missing, known, self._alike(base, number)
+                    self._split,
+                    number,
+                    base,
+                    self._rooms[base],
+                    missing,
+                    known,
+                    self._alike(base, number),
+                    self._told(base, numbers.start),
                 )
                 for number in numbers
                 if number not in made
@@ -370,6 +377,14 @@ class _SplitOrders:
         """Return the number of tasks of a base scene before this variant, by kind of goal."""
         records = self._before(before) if self._most_alike is not None else ()
         return Counter(record.signature for record in records if base_scene_of(record.task.scene_id) == base)
+
+    def _told(self, base: str, before: int) -> tuple[str, ...]:
+        """Return the instructions of a base scene's tasks before this variant."""
+        return tuple(
+            record.task.instruction
+            for record in self._before(before)
+            if base_scene_of(record.task.scene_id) == base
+        )
 
     def _before(self, number: int) -> Iterator[TaskRecord]:
         for result in self._store.results:

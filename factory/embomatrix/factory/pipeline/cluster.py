@@ -6,11 +6,10 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
-from embomatrix.factory.admission import SEED, RefusalReason
+from embomatrix.factory.admission import SEED, RefusalReason, oracle_plan
 from embomatrix.factory.pipeline.store import Rejection, VariantYield
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout, RolloutResult
-from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import DatasetError, TaskRecord
 
 RUN: Final = "factory"
@@ -48,7 +47,7 @@ async def _execute(client: ClusterClient, run_id: str, variant: VariantYield) ->
             group_id=record.task.task_id,
             bundle_digest=record.bundle_digest,
             task_id=record.task.task_id,
-            plan=plan_from_json(list(record.oracle), record.task.profile),
+            plan=oracle_plan(record),
             seed=SEED,
         )
         for record in records

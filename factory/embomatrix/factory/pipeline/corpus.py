@@ -7,11 +7,13 @@ from typing import Final
 
 from embomatrix.factory.pipeline.merge import MERGED_FILE, MergeSummary, Resolution, merge_datasets
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
+from embomatrix.factory.pipeline.store import BUILD_FILE
 from embomatrix.factory.scenes.build import base_scene_of
+from embomatrix.starter.archive import content_digest, read_packed
 from embomatrix.starter.recipes import PARTS, SEED, Recipe
 from embomatrix.starter.shipped import FrozenTasks, freeze
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, TaskRecord
 from embomatrix.world.difficulty import DifficultyLevel, shuffle_key
 
 PARTS_FOLDER: Final = "parts"
@@ -47,14 +49,42 @@ def check_free(folder: Path) -> None:
 def join_parts(folder: Path, parts: Sequence[int]) -> MergeSummary:
     """Write the tasks of the parts as one dataset. A training task that gives a held-out one away is left out.
 
-    Raises DatasetError if a scene is on both sides, or OSError.
+    An error leaves the tasks of an earlier call as they are. Raises DatasetError if a part is missing or a scene is on both
+    sides, or OSError.
     """
-    shutil.rmtree(folder / TASKS, ignore_errors=True)
-    joined = merge_datasets(
-        [part_folder(folder, part) for part in parts], folder / TASKS, Resolution.DROP_TRAIN
-    )
-    _check_apart(joined.records)
+    for part in parts:
+        if not (part_folder(folder, part) / TASKS_FILE).exists():
+            raise DatasetError(
+                f"part {part} is not complete in {part_folder(folder, part)}: make it with "
+                f"`embomatrix factory corpus --out {folder} --part {part}`"
+            )
+    fresh = folder / f"{TASKS}.partial"
+    shutil.rmtree(fresh, ignore_errors=True)
+    try:
+        joined = merge_datasets([part_folder(folder, part) for part in parts], fresh, Resolution.DROP_TRAIN)
+        _check_apart(joined.records)
+        shutil.rmtree(folder / TASKS, ignore_errors=True)
+        fresh.replace(folder / TASKS)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
     return joined
+
+
+def is_finished(folder: Path) -> bool:
+    """True if a folder holds a build that ran to its end; an interrupted one has a log and no tasks yet."""
+    return (folder / BUILD_FILE).exists() and (folder / TASKS_FILE).exists()
+
+
+def holds_build_of(folder: Path, archive: Path) -> bool:
+    """True if a build gave the tasks of a shipped part, besides those that are left out of the corpus.
+
+    Raises DatasetError or OSError.
+    """
+    records, _, expected = read_packed(archive)
+    shipped = {record.task.task_id for record in records}
+    built = Dataset.load(folder)
+    found = tuple(record for record in built.records if record.task.task_id in shipped)
+    return content_digest(Dataset(built.folder, found)) == expected
 
 
 def joined_part(folder: Path, part: int) -> Dataset:

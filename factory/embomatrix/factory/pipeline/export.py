@@ -35,7 +35,9 @@ FIELDS: Final[Mapping[str, str]] = {
     "bundle": "digest of the bundle; bundles are not part of the export",
     "transcript": "Markdown: conversation behind the request, empty if there is none",
 }
-MIT_SOURCES: Final = frozenset(("writer", "behavior-1k", "embomatrix"))
+OWN_SOURCES: Final = frozenset(("writer", "society"))
+"""Sources of tasks that the factory wrote; all others are imported."""
+MIT_SOURCES: Final = OWN_SOURCES | {"behavior-1k", "embomatrix"}
 """Sources of tasks whose text is under the MIT licence."""
 CARD_MARK: Final = "pretty_name: EmboMatrix tasks"
 """Line in the header of each card."""
@@ -130,7 +132,7 @@ def dataset_card(dataset: Dataset, file_name: str, data: bytes) -> str:
         "",
         "## Settings",
         "",
-        _settings(dataset.folder),
+        _settings(dataset),
         "",
         "## Load it",
         "",
@@ -171,8 +173,9 @@ def _counts(records: Sequence[TaskRecord]) -> list[str]:
 _LICENCES: Final = (
     "Names, categories, sizes and room inventories derive from the catalog of PyPI `bddl` 3.6.0: MIT licence, copyright "
     "Stanford Vision and Learning Lab; keep this notice with copies. Instructions, goals, plans and transcripts are under the "
-    "MIT licence of the EmboMatrix project. Tasks whose source is not `writer` come from BDDL problems of others, and their "
-    "text is under the licence of that source: MIT for `behavior-1k` and `embomatrix`; ask the author for `eai` and `file`."
+    "MIT licence of the EmboMatrix project. Tasks whose source is neither `writer` nor `society` come from BDDL problems of "
+    "others, and their text is under the licence of that source: MIT for `behavior-1k` and `embomatrix`; ask the author for "
+    "`eai` and `file`."
 )
 
 _SOURCES: Final = (
@@ -184,14 +187,21 @@ _SOURCES: Final = (
 )
 
 
-def _settings(folder: Path) -> str:
-    """Describe the settings of the build, if its log exists."""
+def _settings(dataset: Dataset) -> str:
+    """Describe the settings of the build if its log exists, else the origin as far as it is known."""
     try:
-        settings = build_settings(folder)
+        settings = build_settings(dataset.folder)
     except DatasetError:
-        return merge_in_words(folder) or "The folder holds no build settings: these tasks were imported."
+        return merge_in_words(dataset.folder) or _origin(dataset.records)
     listed = ", ".join(f"{name} `{value}`" for name, value in settings.items() if name != "scenes")
     return f"`embomatrix factory`, settings: {listed}, {len(settings.get('scenes', ()))} scenes."
+
+
+def _origin(records: Sequence[TaskRecord]) -> str:
+    """Return a sentence about tasks in a folder without settings. Only imported tasks are written without any."""
+    if not any(record.task.source in OWN_SOURCES for record in records):
+        return "The folder holds no build settings: these tasks were imported."
+    return "The folder holds no build settings: they are unknown."
 
 
 def merge_in_words(folder: Path) -> str:

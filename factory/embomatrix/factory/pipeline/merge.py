@@ -3,7 +3,7 @@
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from hashlib import sha256
 from pathlib import Path
@@ -91,8 +91,9 @@ def merge_datasets(
 ) -> MergeSummary:
     """Write the tasks of all datasets into a new folder.
 
-    Exact duplicates are dropped. Raise DatasetError if two tasks differ and have one id, if a training task gives a
-    held-out task of another dataset away and ``resolution`` says to refuse, or if the folder is not empty; OSError.
+    Exact duplicates are dropped. If only one of two has a measured difficulty, that is kept. Raise DatasetError if two tasks
+    differ and have one id, if a training task gives a held-out task of another dataset away and ``resolution`` says to
+    refuse, or if the folder is not empty; OSError.
     """
     if out.exists() and any(out.iterdir()):
         raise DatasetError(f"{out} is not empty: a merge overwrites nothing; name another folder with --out")
@@ -114,29 +115,40 @@ def merge_datasets(
 
 
 def _distinct(datasets: Sequence[Dataset]) -> list[SourcedRecord]:
-    """Return the records without exact duplicates. Raise DatasetError if tasks of one id differ in more than their split."""
+    """Return the records without exact duplicates. Raise DatasetError if tasks of one id differ in more than their split.
+
+    Difficulties are not compared: they are measured later, and depend on the training tasks.
+    """
     members: list[SourcedRecord] = []
-    known: defaultdict[str, list[SourcedRecord]] = defaultdict(list)
+    known: defaultdict[str, list[int]] = defaultdict(list)
     for number, dataset in enumerate(datasets):
         for record in dataset.records:
             alike = known[record.task.task_id]
-            if any(other.record == record for other in alike):
+            same = next((at for at in alike if _unmeasured(members[at].record) == _unmeasured(record)), None)
+            if same is not None:
+                if members[same].record.difficulty is None:
+                    members[same] = replace(members[same], record=record)
                 continue
-            for other in alike:
+            for other in (members[at] for at in alike):
                 if differing := _differences(other.record, record):
                     raise DatasetError(
                         f"two tasks have the id {record.task.task_id!r} and differ in {', '.join(differing)}: one in "
                         f"{datasets[other.source].folder}, one in {dataset.folder}; build one of them with another seed"
                     )
+            alike.append(len(members))
             members.append(SourcedRecord(number, record))
-            alike.append(members[-1])
     return members
 
 
+def _unmeasured(record: TaskRecord) -> TaskRecord:
+    return replace(record, difficulty=None)
+
+
 def _differences(first: TaskRecord, second: TaskRecord) -> list[str]:
-    """Return the fields in which two records of one id differ, without the split."""
+    """Return the fields in which two records of one id differ, without the split and the difficulty."""
     a, b = record_to_json(first), record_to_json(second)
-    return sorted(name for name in a.keys() | b.keys() if name != "split" and a.get(name) != b.get(name))
+    names = (a.keys() | b.keys()) - {"split", "difficulty"}
+    return sorted(name for name in names if a.get(name) != b.get(name))
 
 
 def split_conflicts(members: Sequence[SourcedRecord]) -> Iterator[SplitConflict]:
@@ -199,13 +211,13 @@ def _write(out: Path, datasets: Sequence[Dataset], members: Sequence[SourcedReco
                     f"expected {digest}; copy the dataset again"
                 )
             write_whole(path, data)
-        _copy_texts(dataset.folder, out, each.record.task.task_id)
+        copy_texts(dataset.folder, out, each.record.task.task_id)
     sources = [asdict(_source_of(dataset)) for dataset in datasets]
     write_whole(out / MERGED_FILE, (json.dumps(sources, indent=1) + "\n").encode("ascii"))
     write_dataset(out, [each.record for each in members], {})
 
 
-def _copy_texts(folder: Path, out: Path, task_id: str) -> None:
+def copy_texts(folder: Path, out: Path, task_id: str) -> None:
     """Copy the task's transcript and layout tree, if there are any. An id that is a path has none."""
     for name, suffix in ((TRANSCRIPTS_FOLDER, "md"), (TREES_FOLDER, "json")):
         path = folder / name / f"{task_id}.{suffix}"

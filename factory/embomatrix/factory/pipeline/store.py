@@ -104,6 +104,8 @@ ATTEMPTS_FILE: Final = "attempts.jsonl"
 """Log with a line for every draft and the reason of each rejection."""
 TIMES_FILE: Final = "times.jsonl"
 """CPU seconds of each variant and of the base scenes of each call. They are not part of the dataset."""
+RETOLD: Final = "retold"
+"""Mark in `TIMES_FILE` of a variant whose tasks an earlier build proved. Such variants are not part of admission figures."""
 TRANSCRIPTS_FOLDER: Final = "transcripts"
 TREES_FOLDER: Final = "trees"
 """Layout trees as nested JSON, one file per task."""
@@ -135,7 +137,7 @@ class VariantResult:
 class VariantYield:
     """Result of a variant: records, their bundle, and transcripts and layout trees by task id.
 
-    ``cpu_s`` is the CPU time and does not affect equality.
+    ``cpu_s`` is the CPU time. ``retold`` says that an earlier build proved the tasks. Neither affects equality.
     """
 
     result: VariantResult
@@ -143,6 +145,7 @@ class VariantYield:
     transcripts: Mapping[str, str]
     trees: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     cpu_s: float = field(default=0.0, compare=False)
+    retold: bool = field(default=False, compare=False)
 
 
 def build_settings(folder: Path) -> dict[str, Any]:
@@ -156,6 +159,13 @@ def build_settings(folder: Path) -> dict[str, Any]:
             f"{path} does not hold the settings of a build ({error}): name a folder written by `factory build`, "
             "`generate` or `corpus`"
         ) from error
+
+
+def build_results(folder: Path) -> list[VariantResult]:
+    """Return the finished variants of a build. Raise DatasetError if the folder holds no build, or OSError."""
+    log = ResumableLog[VariantResult](folder / BUILD_FILE, _to_json)
+    log.resume({"settings": build_settings(folder)}, _from_json)
+    return log.outcomes
 
 
 class BuildStore:
@@ -178,7 +188,8 @@ class BuildStore:
     def add(self, variant: VariantYield) -> None:
         """Store a variant's result. Its other files are written before its line in the log."""
         result = variant.result
-        self.spend({"split": result.split, "variant": result.number}, variant.cpu_s)
+        work: dict[str, str | int] = {"split": result.split, "variant": result.number}
+        self.spend({**work, RETOLD: True} if variant.retold else work, variant.cpu_s)
         if result.records:
             path = self._folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
             write_whole(path, variant.bundle)

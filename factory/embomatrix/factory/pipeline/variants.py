@@ -65,7 +65,8 @@ FOCUS_ROOMS: Final = 3
 class VariantOrder:
     """Order for one variant of a base scene. ``rooms`` are those of its split; ``known`` holds keys of existing tasks.
 
-    ``alike`` counts the existing tasks of the base scene by the kind of their goal.
+    ``alike`` counts the existing tasks of the base scene by the kind of their goal. ``told`` are the instructions of its tasks
+    in this split, in the order of their variants.
     """
 
     split: str
@@ -75,6 +76,7 @@ class VariantOrder:
     missing: Mapping[TaskCategory, int]
     known: frozenset[str]
     alike: Mapping[str, int] = field(default_factory=dict)
+    told: tuple[str, ...] = ()
 
 
 class VariantMaker:

@@ -26,6 +26,8 @@ FIGURES: Final[Mapping[str, tuple[str, float]]] = {
 }
 """Name and target of the figure for each source."""
 SOLVED_GOAL: Final = 0.95
+MOST_NAMED: Final = 4
+"""Number of base scenes up to which the conditions name them; more are counted."""
 REPORT_MARK: Final = b"# Imported problems"
 """First line of each report in Markdown."""
 FAITHFUL_GOAL: Final = 0.6
@@ -175,43 +177,93 @@ def _faithfulness(outcomes: Sequence[ProblemOutcome]) -> list[str]:
     return lines
 
 
-def evaluation_of(outcomes: Sequence[ProblemOutcome], seed: int) -> EvaluationFigures:
-    """Return import rates by source, and the share of goals that each profile reaches."""
+@dataclass(frozen=True, slots=True)
+class ImportScope:
+    """Scope of an import: its depth, base scenes and filters. Rates of different scopes are not comparable.
+
+    ``reached_by`` and ``solids`` say which problems were left out beforehand.
+    """
+
+    depth: str = ""
+    scenes: tuple[str, ...] = ()
+    reached_by: Profile | None = None
+    solids: bool = False
+
+    @property
+    def is_filtered(self) -> bool:
+        """True if problems are left out, or refused because no skill reaches their goals."""
+        return self.reached_by is not None or self.solids or self.depth == "bind"
+
+    @property
+    def conditions(self) -> dict[str, str | int]:
+        """Scope as conditions of measurement."""
+        filters = (
+            *((f"reached by {self.reached_by}",) if self.reached_by is not None else ()),
+            *(("without liquids",) if self.solids else ()),
+        )
+        named = ", ".join(self.scenes)
+        return {
+            **({"depth": self.depth} if self.depth else {}),
+            **(
+                {"base scenes": named if len(self.scenes) <= MOST_NAMED else len(self.scenes)}
+                if self.scenes
+                else {}
+            ),
+            **({"problems": " and ".join(filters)} if filters else {}),
+        }
+
+
+EVERYTHING: Final = ImportScope()
+
+
+def evaluation_of(
+    outcomes: Sequence[ProblemOutcome], seed: int, scope: ImportScope = EVERYTHING
+) -> EvaluationFigures:
+    """Return import rates by source, and the share of goals that each profile reaches.
+
+    Only rates of all problems have goals: a filter leaves out those that are hard to bind.
+    """
     figures: list[Figure] = []
     for source, (name, goal) in FIGURES.items():
         selected = [outcome for outcome in outcomes if outcome.source == source]
         if not selected:
             continue
         n = len(selected)
-        figures.append(Figure(name, sum(each.is_bound for each in selected) / n, "", Better.HIGHER, n, goal))
+        bound = sum(each.is_bound for each in selected) / n
+        figures.append(Figure(name, bound, "", Better.HIGHER, n, None if scope.is_filtered else goal))
         for profile in Profile:
             reached = sum(each.is_reached_by(profile) for each in selected)
             figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", Better.NEITHER, n))
-        figures += _faithful_shares(selected, name)
-    return EvaluationFigures("imports", {"seed": seed}, tuple(figures))
+        figures += _faithful_shares(selected, name, None if scope.is_filtered else FAITHFUL_GOAL)
+    return EvaluationFigures("imports", {"seed": seed, **scope.conditions}, tuple(figures))
 
 
-def _faithful_shares(outcomes: Sequence[ProblemOutcome], name: str) -> list[Figure]:
+def _faithful_shares(
+    outcomes: Sequence[ProblemOutcome], name: str, faithful_goal: float | None
+) -> list[Figure]:
     """Return the share of problems bound without changes: of those with a right scene, and of all."""
     right = [each for each in outcomes if each.has_right_scene]
     title = name.replace("import_rate", "faithful_share")
     figures = []
-    for selected, words, goal in ((right, "", FAITHFUL_GOAL), (outcomes, " of all", None)):
+    for selected, words, goal in ((right, "", faithful_goal), (outcomes, " of all", None)):
         if selected:
             share = sum(each.is_faithful for each in selected) / len(selected)
             figures.append(Figure(f"{title}{words}", share, "", Better.HIGHER, len(selected), goal))
     return figures
 
 
-def solved_of(outcomes: Sequence[ProblemOutcome], seed: int, *, solids: bool = False) -> EvaluationFigures:
+def solved_of(
+    outcomes: Sequence[ProblemOutcome], seed: int, scope: ImportScope = EVERYTHING
+) -> EvaluationFigures:
     """Return the share of reachable goals that the oracle solved, by source and profile.
 
-    ``solids`` is true if problems with substances were left out.
+    The names of these figures say over which problems they are, so they keep their goals under a filter. After a filter by a
+    profile, only that profile has figures: the others would lack problems.
     """
-    without = " without liquids" if solids else ""
+    without = " without liquids" if scope.solids else ""
     figures: list[Figure] = []
     for source, (name, _) in FIGURES.items():
-        for profile in Profile:
+        for profile in Profile if scope.reached_by is None else (scope.reached_by,):
             selected = [each for each in outcomes if each.source == source and each.is_reached_by(profile)]
             if selected:
                 title = (
@@ -220,4 +272,4 @@ def solved_of(outcomes: Sequence[ProblemOutcome], seed: int, *, solids: bool = F
                 goal = SOLVED_GOAL if profile is Profile.PAPER else None
                 share = sum(each.is_bound for each in selected) / len(selected)
                 figures.append(Figure(title, share, "", Better.HIGHER, len(selected), goal))
-    return EvaluationFigures("imports", {"seed": seed}, tuple(figures))
+    return EvaluationFigures("imports", {"seed": seed, **scope.conditions}, tuple(figures))

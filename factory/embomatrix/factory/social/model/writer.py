@@ -106,14 +106,14 @@ class ModelWriter(OnOneLoop):
                 found += self._told(home, outcome)
         return found
 
-    def _told(self, home: _Home, outcome: Sequence[Outcome] | LlmError) -> list[Outcome]:
+    def _told(self, home: _Home, outcome: Sequence[Outcome | LlmError] | LlmError) -> list[Outcome]:
         """Return the outcome of a dialogue, and remember its instructions. Raise LlmError at the limit of failures."""
         if isinstance(outcome, LlmError):
             return [self._counted(outcome)]
         self._missing.answered()
         self._garbage.answered()
         home.written += [each.instruction for each in outcome if isinstance(each, WrittenRequest)]
-        return list(outcome)
+        return [self._counted(each) if isinstance(each, LlmError) else each for each in outcome]
 
     def _counted(self, error: LlmError) -> TaskRefusal:
         """Return the refusal for an error. Raise the error if it is one of several in a row."""
@@ -148,8 +148,11 @@ class ModelWriter(OnOneLoop):
 
     async def _requests(
         self, home: _Home, scene: SceneKinds, event: EventAnswer, seed: int
-    ) -> list[Outcome] | LlmError:
-        """Return the outcome of a dialogue about an event, or the error that ended it."""
+    ) -> list[Outcome | LlmError] | LlmError:
+        """Return the outcome of a dialogue about an event, or the error that ended it.
+
+        An error in the correction of refused requests does not cost the requests that were good already.
+        """
 
         def seeds(number: int) -> int:
             return _seed(seed, scene.base, home.days, event.time, event.person, number)
@@ -159,12 +162,18 @@ class ModelWriter(OnOneLoop):
             summary = await self._agents.summarise(scene, turns, seeds(100))
             judge = _Judge(self._agents, scene, home.household.cast((event.slot(),)), event)
             good, refused = await judge.judged(summary.requests, seeds(101))
-            if refused:
+        except LlmError as error:
+            return error
+        failed: list[LlmError] = []
+        if refused:
+            try:
                 again = await self._corrected(scene, turns, refused, seeds)
                 better, refused = await judge.judged(again, seeds(103)) if again else ([], refused)
                 good += better
-        except LlmError as error:
-            return error
+            except LlmError as error:
+                if not good:
+                    return error
+                failed.append(error)
         conversation = conversation_of(event, turns, tuple(each.instruction for each in good) or ("",))
         written = [
             WrittenRequest(
@@ -172,7 +181,7 @@ class ModelWriter(OnOneLoop):
             )
             for each in good
         ]
-        return [*written, *(_refusal(faults) for _, faults in refused)]
+        return [*written, *(_refusal(faults) for _, faults in refused), *failed]
 
     async def _corrected(
         self,
