@@ -64,7 +64,7 @@ class ClusterSimulation:
         self._connect = connect
         self._stack = contextlib.AsyncExitStack()
         self._run = contextlib.AsyncExitStack()
-        """What is closed with the run."""
+        """Context of the run: its end closes the run."""
         self._opening = asyncio.Lock()
         self._sent: set[str] = set()
         self._announced = 0

@@ -86,7 +86,7 @@ def run_routes(runtime: ManagerRuntime, snapshots: Snapshots, gallery: Gallery |
         summary="One recent plan or episode of a run",
     )
     async def plan(run_id: RunId, number: PlanNumber) -> Response:
-        """What the policy wrote and what became of it, call by call on the floor plan; of an episode also each observation."""
+        """Text of the policy and what became of it, call by call on the floor plan; of an episode also each observation."""
         training = await history.training(run_id)
         count = len(training.plans)
         if not 1 <= number <= count:
