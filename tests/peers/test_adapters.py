@@ -301,22 +301,109 @@ asyncio.run(main())
 """
 
 
+VERL_LIBRARIES = (
+    *("tensordict", "omegaconf", "hydra-core", "ray", "transformers", "codetiming", "pandas", "datasets"),
+    *("cachetools", "uvicorn", "fastapi", "verl==0.9.1"),
+)
+
+
 async def test_verl_s_reward_manager_awaits_the_cluster(cluster, dataset):
-    libraries = (
-        "tensordict",
-        "omegaconf",
-        "hydra-core",
-        "ray",
-        "transformers",
-        "codetiming",
-        "pandas",
-        "datasets",
-    )
-    peer = Peer("verl", TORCH, *libraries, "verl==0.9.1")
-    (options,) = snippets("adapters.md", "verl", "")
+    peer = Peer("verl", TORCH, *VERL_LIBRARIES)
+    options, _ = snippets("adapters.md", "verl", "")
     options = options.replace("build/dataset", str(dataset))
     printed = peer.run("-c", VERL, dataset, options, EMBOMATRIX_MANAGER=cluster[0].address)
     rows = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
     assert [each["success"] for each in rows] == [1, 1, 1, 0, 0, 0]
     assert all(each["score"] == each["format"] + each["relevance"] + each["goal"] for each in rows)
     assert [each["score"] for each in rows[3:]] == [-1, -1, -1]
+
+
+VERL_EPISODES = r"""
+import asyncio, json, sys
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from tokenizers import Regex, Tokenizer, decoders
+from tokenizers.models import WordLevel
+from tokenizers.pre_tokenizers import Split
+from transformers import PreTrainedTokenizerFast
+from verl.experimental.agent_loop.agent_loop import DictConfigWrap
+from verl.workers.rollout.replica import TokenOutput
+from embomatrix.trainer.adapters.rows import verl_rows
+
+dataset, loops, length = sys.argv[1], sys.argv[2], int(sys.argv[3])
+letters = ["<end>", "<unknown>", *map(chr, range(32, 127)), "\n"]
+inner = Tokenizer(WordLevel({letter: at for at, letter in enumerate(letters)}, unk_token="<unknown>"))
+inner.pre_tokenizer = Split(Regex("[\\s\\S]"), "isolated")
+inner.decoder = decoders.Fuse()
+tokenizer = PreTrainedTokenizerFast(
+    tokenizer_object=inner, eos_token="<end>", pad_token="<end>", unk_token="<unknown>",
+    chat_template="{% for m in messages %}{{ m.role }}: {{ m.content }}<end>{% endfor %}"
+    "{% if add_generation_prompt %}assistant: {% endif %}",
+)
+config = OmegaConf.create(
+    {"actor_rollout_ref": {"rollout": {"prompt_length": 4000, "response_length": length}}, "data": {}}
+)
+(loop,) = OmegaConf.load(loops)
+loop.dataset = dataset
+answers = iter(sys.argv[4:])
+
+class Server:
+    asked = []
+    async def generate(self, request_id, prompt_ids, sampling_params):
+        self.asked.append(list(prompt_ids))
+        ids = [*tokenizer.encode(next(answers), add_special_tokens=False), tokenizer.eos_token_id]
+        return TokenOutput(token_ids=ids, log_probs=[-0.5] * len(ids))
+
+async def main():
+    server = Server()
+    player = instantiate(
+        loop, trainer_config=DictConfigWrap(config), server_manager=server, tokenizer=tokenizer, processor=None,
+        dataset_cls=None, data_config=DictConfigWrap(config.data), hf_model_type="llama",
+    )
+    (row,) = [row for row in verl_rows(dataset) if row["reward_model"]["ground_truth"] == "apple_to_counter"]
+    played = await player.run({}, raw_prompt=row["prompt"], **row)
+    ids = [*played.prompt_ids, *played.response_ids]
+    own = [token for token, is_own in zip(played.response_ids, played.response_mask) if is_own]
+    print(json.dumps({
+        "prompt": tokenizer.decode(played.prompt_ids), "own": tokenizer.decode(own), "reward": played.reward_score,
+        "info": played.extra_fields["reward_extra_info"], "turns": played.num_turns,
+        "appended": all(ids[:len(asked)] == asked for asked in server.asked if len(asked) <= len(ids)),
+        "lengths": [len(played.response_ids), len(played.response_mask), len(played.response_logprobs)],
+    }))
+
+asyncio.run(main())
+"""
+ANSWERS = ("I look around.", "move 10", "pick_up 10", "move 0", "place 0 ontop", "done")
+
+
+def played_by_verl(cluster, dataset, length):
+    """Return what verl's agent loop makes of an episode with the answers and room for so many tokens."""
+    peer = Peer("verl", TORCH, *VERL_LIBRARIES)
+    arguments = (dataset, EXAMPLES / "verl_episodes.yaml", length, *ANSWERS)
+    printed = peer.run("-c", VERL_EPISODES, *arguments, EMBOMATRIX_MANAGER=cluster[0].address)
+    return json.loads(printed.splitlines()[-1])
+
+
+async def test_verl_s_agent_loop_plays_an_episode(cluster, dataset):
+    played = await asyncio.to_thread(played_by_verl, cluster, dataset, 4000)
+    assert "system: You control a home robot step by step." in played["prompt"]
+    assert played["own"] == "".join(f"{answer}<end>" for answer in ANSWERS)
+    assert played["appended"]
+    assert (played["turns"], len({*played["lengths"]})) == (12, 1)
+    assert played["reward"] > 30
+    assert played["reward"] == pytest.approx(
+        sum(played["info"][tier] for tier in ("format", "relevance", "goal"))
+    )
+    assert {name: played["info"][name] for name in ("success", "calls", "failed_calls")} == {
+        "success": 1.0,
+        "calls": 5.0,
+        "failed_calls": 1.0,
+    }
+
+
+async def test_verl_s_agent_loop_ends_where_the_response_has_no_room(cluster, dataset):
+    played = await asyncio.to_thread(played_by_verl, cluster, dataset, 200)
+    assert played["lengths"] == [200, 200, 200]
+    assert played["appended"]
+    assert played["info"]["success"] == 0.0
+    assert played["own"].startswith("I look around.<end>")

@@ -4,13 +4,7 @@ Commands of verifiers load both classes from a single-word module such as `docs/
 in the process of verifiers' environment, or on the cluster that ``EMBOMATRIX_MANAGER`` names.
 """
 
-import asyncio
-import functools
-import os
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Final, TypeVar
+from collections.abc import Iterator
 
 try:
     import verifiers.v1 as vf
@@ -20,10 +14,8 @@ except ModuleNotFoundError as error:
         name=error.name,
     ) from None
 
-from embomatrix.envs.environment import Environment
-from embomatrix.envs.opening import make
 from embomatrix.envs.rules import EpisodeRules, Visibility, rules_of
-from embomatrix.rpc.cluster_address import cluster_named
+from embomatrix.envs.shared import in_thread, shared_environment
 from embomatrix.skills.episode_text import system_for_answers
 from embomatrix.skills.prompt import Codec
 from embomatrix.skills.seeds import evaluation_seed, training_seed
@@ -31,11 +23,6 @@ from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.starter.shipped import SEARCH
 
 __all__ = ["EpisodesEnv", "EpisodesTaskset"]
-
-T = TypeVar("T")
-_WAITING: Final = ThreadPoolExecutor(256, "episodes")
-"""Threads that wait for turns, one for each episode that verifiers plays at a time."""
-_OPENING: Final = threading.Lock()
 
 
 class EpisodesConfig(vf.TasksetConfig):
@@ -75,7 +62,9 @@ class EpisodesTaskset(vf.Taskset[EpisodesTask, EpisodesConfig]):
         config = self.config
         rules = rules_of(EpisodeRules(calls=config.calls), config.visibility)
         seed_of = training_seed if config.split == "train" else evaluation_seed
-        for record in _opened(config.dataset, config.split, config.visibility, config.calls).records:
+        for record in shared_environment(
+            config.dataset, config.split, config.visibility, config.calls
+        ).records:
             task = record.task
             data = EpisodesData(
                 id=task.task_id,
@@ -109,12 +98,14 @@ class EpisodesEnv(vf.Env[EpisodesEnvConfig]):
 
     async def run(self, task: EpisodesTask, agents: vf.Agents) -> None:
         data = task.data
-        environment = await _waiting(_opened, data.dataset, data.split, data.visibility, data.calls)
-        (episode,) = await _waiting(environment.begin, [(str(data.id), data.simulation_seed)])
+        environment = await in_thread(
+            shared_environment, data.dataset, data.split, data.visibility, data.calls
+        )
+        (episode,) = await in_thread(environment.begin, [(str(data.id), data.simulation_seed)])
         async with agents.agent.interaction(task) as interaction:
             segment = await interaction.turn(episode.prompt.user)
             while not segment.terminated:
-                (observation,) = await _waiting(environment.answer, [episode], [segment.last_reply])
+                (observation,) = await in_thread(environment.answer, [episode], [segment.last_reply])
                 if observation.end is not None:
                     break
                 segment = await interaction.turn(observation.text)
@@ -128,30 +119,3 @@ class EpisodesEnv(vf.Env[EpisodesEnvConfig]):
                 "failed_calls": float(reward.failures),
             }
         )
-
-
-def _opened(dataset: str, split: str, visibility: str, calls: int) -> Environment:
-    """Return the environment of all episodes with these settings in this process. Raises what ``make`` raises."""
-    with _OPENING:  # two threads would open two
-        return _opened_once(dataset, split, visibility, calls)
-
-
-@functools.cache
-def _opened_once(dataset: str, split: str, visibility: str, calls: int) -> Environment:
-    rules = EpisodeRules(calls=calls)
-    if not os.environ.get("EMBOMATRIX_MANAGER"):
-        return make(dataset, split=split, visibility=visibility, rules=rules)
-    named = cluster_named()
-    return make(
-        dataset,
-        split=split,
-        visibility=visibility,
-        rules=rules,
-        manager=named.manager,
-        token=named.token,
-        ca=named.ca,
-    )
-
-
-async def _waiting(work: Callable[..., T], *arguments: Any) -> T:
-    return await asyncio.get_running_loop().run_in_executor(_WAITING, work, *arguments)
