@@ -5,7 +5,6 @@
 
 import asyncio
 import functools
-import os
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -23,10 +22,9 @@ except ModuleNotFoundError as error:
     ) from None
 
 from embomatrix.envs.environment import Environment
-from embomatrix.envs.opening import make
+from embomatrix.envs.opening import make_where_named
 from embomatrix.envs.rules import EpisodeReward, EpisodeRules, Visibility, rules_of
 from embomatrix.envs.tools import TOOLS, PaperTools, system_text
-from embomatrix.rpc.cluster_address import cluster_named
 from embomatrix.skills.seeds import evaluation_seed
 from embomatrix.skills.syntax import MAX_STEPS, PROFILES
 from embomatrix.starter.shipped import STARTER
@@ -52,7 +50,7 @@ def household(
     refuses.
     """
     rules = rules_of(EpisodeRules(calls=calls), visibility)
-    environment = _opened(dataset, split, rules, manager)
+    environment = make_where_named(dataset, split, rules, manager)
     samples = [
         Sample(
             input=record.task.instruction,
@@ -70,13 +68,6 @@ def household(
         solver=play_episode(environment),
         scorer=final_state(),
     )
-
-
-def _opened(dataset: str, split: str, rules: EpisodeRules, manager: str) -> Environment:
-    if not (manager or os.environ.get("EMBOMATRIX_MANAGER")):
-        return make(dataset, split=split, rules=rules)
-    named = cluster_named(manager)
-    return make(dataset, split=split, rules=rules, manager=named.manager, token=named.token, ca=named.ca)
 
 
 @solver

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from embomatrix.envs.environment import Environment
@@ -43,6 +44,19 @@ def make(
     loaded = dataset_named(dataset)
     simulation = _simulation(loaded, reward, manager, token, ca)
     return Environment(loaded, split, known, form, simulation, seed)
+
+
+def make_where_named(dataset: str, split: str, rules: EpisodeRules, manager: str = "") -> Environment:
+    """Open an environment on the cluster that ``manager`` or ``EMBOMATRIX_MANAGER`` names, or in this process if none does.
+
+    Raises what ``make`` raises.
+    """
+    if not (manager or os.environ.get("EMBOMATRIX_MANAGER")):
+        return make(dataset, split=split, rules=rules)
+    from embomatrix.rpc.cluster_address import cluster_named  # needs gRPC
+
+    named = cluster_named(manager)
+    return make(dataset, split=split, rules=rules, manager=named.manager, token=named.token, ca=named.ca)
 
 
 def _simulation(dataset: Dataset, reward: RewardSettings, address: str, token: str, ca: bytes) -> Simulation:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from embomatrix.envs.opening import make
-from embomatrix.envs.rules import EpisodeRules
-from embomatrix.rpc.cluster_address import cluster_named
+from embomatrix.envs.opening import make_where_named
+from embomatrix.envs.rules import EpisodeRules, rules_of
 
 if TYPE_CHECKING:
     from embomatrix.envs.environment import Environment
@@ -34,19 +32,7 @@ def shared_environment(dataset: str, split: str, visibility: str, calls: int) ->
 
 @functools.cache
 def _opened(dataset: str, split: str, visibility: str, calls: int) -> Environment:
-    rules = EpisodeRules(calls=calls)
-    if not os.environ.get("EMBOMATRIX_MANAGER"):
-        return make(dataset, split=split, visibility=visibility, rules=rules)
-    named = cluster_named()
-    return make(
-        dataset,
-        split=split,
-        visibility=visibility,
-        rules=rules,
-        manager=named.manager,
-        token=named.token,
-        ca=named.ca,
-    )
+    return make_where_named(dataset, split, rules_of(EpisodeRules(calls=calls), visibility))
 
 
 async def in_thread(work: Callable[..., T], *arguments: Any) -> T:

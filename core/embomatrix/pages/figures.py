@@ -108,7 +108,7 @@ class Interval:
     high: float
 
     def as_percent(self) -> str:
-        return f"{self.value:.1%} [{self.low:.1%}, {self.high:.1%}]"
+        return f"{self.value:z.1%} [{self.low:z.1%}, {self.high:z.1%}]"  # z: no -0.0%
 
 
 def wilson(share: float, count: int) -> Interval:
