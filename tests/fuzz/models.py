@@ -25,7 +25,7 @@ from embomatrix.factory.evaluate.judges import DiversityScores, Impression
 from embomatrix.factory.evaluate.readings import parse_goal
 from embomatrix.factory.evaluate.readings import read_answers as read_readings
 from embomatrix.factory.evaluate.room_plans import read_rooms
-from embomatrix.factory.evaluate.scenes import LayoutMethod, LayoutOutcome, outcome_log
+from embomatrix.factory.evaluate.scenes import LayoutMethod, LayoutOutcome, _models_in, outcome_log
 from embomatrix.factory.importers.convex import _kept as kept_pieces
 from embomatrix.factory.importers.meshes import read_groups
 from embomatrix.factory.importers.model import ModelFileError
@@ -384,6 +384,13 @@ def table() -> dict[str, Decoder]:
             (CassetteError,),
             lambda: (recorded, recorded * 2),
             frozenset({"llm.cassette:_read"}),
+            mutate_json_lines,
+        ),
+        "models of a recording": Decoder(
+            _models_in,
+            (),
+            lambda: (recorded, recorded * 2),
+            frozenset({"factory.evaluate.scenes:_models_in"}),
             mutate_json_lines,
         ),
         "typed answer": Decoder(

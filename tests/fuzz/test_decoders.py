@@ -102,7 +102,7 @@ def test_seeds_reach_the_parsers_that_the_table_lists(name):
 
 def test_parsing_calls_are_found_in_any_function():
     assert "world.json_text:parse_json" in parsing_functions()
-    assert "skills.parse:last_json_plan" in parsing_functions()
+    assert "skills.parse:_json_values" in parsing_functions()
     assert not any(function.startswith("skills.library") for function in parsing_functions())
 
 

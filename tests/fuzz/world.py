@@ -442,14 +442,14 @@ def table() -> dict[str, Decoder]:
             _plan,
             (PlanError,),
             lambda: PLANS,
-            frozenset({"skills.parse:last_json_plan", "skills.parse:_found_instead"}),
+            frozenset({"skills.parse:_json_values", "skills.parse:_found_instead"}),
             mutate_bytes,
         ),
         "answer of an episode": Decoder(
             _answer,
             (PlanError,),
             lambda: ANSWERS,
-            frozenset({"skills.parse:last_json_plan", "skills.parse:_found_instead"}),
+            frozenset({"skills.parse:_json_values", "skills.parse:_found_instead"}),
             mutate_bytes,
         ),
         "line about an object": Decoder(

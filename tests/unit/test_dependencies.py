@@ -38,6 +38,7 @@ HOSTS = {
     "trackio": "experiment tracker of the user",
     "trl": "the user's library, for the adapter",
     "verifiers": "the user's library, for the adapter",
+    "verl": "the user's library, for envs.verl",
     "wandb": "experiment tracker of the user",
 }
 """Libraries that no extra installs: users who have them get a connection to them."""

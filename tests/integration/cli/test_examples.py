@@ -65,7 +65,13 @@ CHECKED = Counter(
     }
 )
 """Blocks with a language, by page, and the tests that check them."""
-NOT_COMMANDS = ("reward.custom_reward_function.", "--reward.remote_url", "reward = ", "format ")
+NOT_COMMANDS = (
+    "reward.custom_reward_function.",
+    "actor_rollout_ref.",
+    "--reward.remote_url",
+    "reward = ",
+    "format ",
+)
 """Beginnings of blocks without a language that are settings of other programs, or formulas."""
 ELSEWHERE = {
     r"^(make|pip|source|docker|PYTHONPATH=|ACCESS=)": "prepares the machine",

@@ -11,7 +11,7 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.status import UnavailableError
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.skills.prompt import Prompt
-from embomatrix.trainer.cluster.gateway import PlanOutcome
+from embomatrix.trainer.cluster.gateway import PlanOutcome, PlayedTurn
 from embomatrix.trainer.config.errors import TrainerError
 from embomatrix.trainer.episodes.client import PlannedEpisode
 from embomatrix.trainer.episodes.oracle import oracle_episodes, successful
@@ -32,7 +32,7 @@ class LostEpisode:
 class SolvedEpisode:
     opening = Prompt("", "Open the fridge.")
     answers = ("open 2", "done")
-    observations = ("open 2: opened fridge 2", "")
+    turns = (PlayedTurn("open 2", "open 2: opened fridge 2", 1), PlayedTurn("done", "", 0))
 
     def outcome(self):
         return PlanOutcome("", RewardBreakdown(1.0, 0.2, 30.0, (), success=True), None)

@@ -214,15 +214,16 @@ async def log_events(
 ) -> AsyncIterator[RunEvent]:
     """Yield the events of a log, oldest first; with ``follow`` also the coming ones, without end.
 
-    ``read`` returns a page of the events with a higher sequence number. Each page begins with the last known event, if
-    it is the same log: a manager that starts anew numbers its events from 1, so its log is read from its begin.
+    ``read`` returns a page of the events with a higher sequence number. A page of a followed log begins with the last known
+    event, if it is the same log: a manager that starts anew numbers its events from 1, so its log is read from its begin.
     """
     last: RunEvent | None = None
     while True:
-        events = (await read(last.sequence - 1 if last is not None else 0)).events
-        if last is not None:
+        events = (await read(0 if last is None else last.sequence - follow)).events
+        if last is not None and follow:
             if not events or (events[0].sequence, events[0].at_s) != (last.sequence, last.at_s):
                 last = None
+                await asyncio.sleep(pause_s)
                 continue
             events = events[1:]
         for event in events:
