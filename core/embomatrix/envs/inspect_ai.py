@@ -115,12 +115,7 @@ def final_state() -> Scorer:
 
 
 def _numbers(reward: EpisodeReward) -> dict[str, float]:
-    return {
-        "success": float(reward.tiers.success),
-        "reward": reward.total,
-        "calls": float(reward.calls),
-        "failed_calls": float(reward.failures),
-    }
+    return {"reward": reward.total, **reward.metrics}
 
 
 def as_inspect_tools(tools: PaperTools) -> list[Tool]:

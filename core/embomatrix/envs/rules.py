@@ -103,3 +103,12 @@ class EpisodeReward:
     @property
     def total(self) -> float:
         return self.tiers.total - self.cost
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Success and counts of calls as numbers, for the logs of other libraries."""
+        return {
+            "success": float(self.tiers.success),
+            "calls": float(self.calls),
+            "failed_calls": float(self.failures),
+        }

@@ -18,7 +18,7 @@ from embomatrix.envs.rules import EpisodeRules, Visibility, rules_of
 from embomatrix.envs.shared import in_thread, shared_environment
 from embomatrix.skills.episode_text import system_for_answers
 from embomatrix.skills.prompt import Codec
-from embomatrix.skills.seeds import evaluation_seed, training_seed
+from embomatrix.skills.seeds import split_seed
 from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.starter.shipped import SEARCH
 
@@ -61,7 +61,6 @@ class EpisodesTaskset(vf.Taskset[EpisodesTask, EpisodesConfig]):
         """Raises ValueError for wrong rules, and DatasetError for a missing dataset."""
         config = self.config
         rules = rules_of(EpisodeRules(calls=config.calls), config.visibility)
-        seed_of = training_seed if config.split == "train" else evaluation_seed
         for record in shared_environment(
             config.dataset, config.split, config.visibility, config.calls
         ).records:
@@ -78,7 +77,7 @@ class EpisodesTaskset(vf.Taskset[EpisodesTask, EpisodesConfig]):
                 split=config.split,
                 visibility=config.visibility,
                 calls=config.calls,
-                simulation_seed=seed_of(config.seed, task.task_id),
+                simulation_seed=split_seed(config.split, config.seed, task.task_id),
                 category=task.category.value,
             )
             yield EpisodesTask(data, config.task)
@@ -112,10 +111,4 @@ class EpisodesEnv(vf.Env[EpisodesEnvConfig]):
         reward, trace = episode.player.reward, interaction.trace
         for tier, value in reward.tiers.tiers.items():
             trace.record_reward(tier, value)
-        trace.record_metrics(
-            {
-                "success": float(reward.tiers.success),
-                "calls": float(reward.calls),
-                "failed_calls": float(reward.failures),
-            }
-        )
+        trace.record_metrics(reward.metrics)

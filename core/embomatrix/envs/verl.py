@@ -18,7 +18,7 @@ except ModuleNotFoundError as error:
 
 from embomatrix.envs.rules import Visibility
 from embomatrix.envs.shared import in_thread, shared_environment
-from embomatrix.skills.seeds import evaluation_seed, training_seed
+from embomatrix.skills.seeds import split_seed
 from embomatrix.skills.syntax import MAX_STEPS
 
 
@@ -46,9 +46,8 @@ class EpisodeAgentLoop(AgentLoopBase):
     async def run(self, sampling_params: dict[str, Any], **row: Any) -> AgentLoopOutput:
         """Play an episode. Raises what executing a turn raises: verl has no mark for a rollout without a result."""
         task_id, split = str(row["reward_model"]["ground_truth"]), str(row["extra_info"]["split"])
-        seed_of = training_seed if split == "train" else evaluation_seed
         environment = await in_thread(shared_environment, self._dataset, split, self._visibility, self._calls)
-        (episode,) = await in_thread(environment.begin, [(task_id, seed_of(self._seed, task_id))])
+        (episode,) = await in_thread(environment.begin, [(task_id, split_seed(split, self._seed, task_id))])
         messages = [
             {"role": "system", "content": episode.prompt.system},
             {"role": "user", "content": episode.prompt.user},
@@ -98,11 +97,6 @@ class EpisodeAgentLoop(AgentLoopBase):
                 **answer.extra_fields,
                 "turn_scores": [],
                 "tool_rewards": [],
-                "reward_extra_info": {
-                    **reward.tiers.tiers,
-                    "success": float(reward.tiers.success),
-                    "calls": float(reward.calls),
-                    "failed_calls": float(reward.failures),
-                },
+                "reward_extra_info": {**reward.tiers.tiers, **reward.metrics},
             },
         )

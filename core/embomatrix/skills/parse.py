@@ -10,7 +10,6 @@ import itertools
 import json
 import math
 import re
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import Any, Final, cast
@@ -218,8 +217,11 @@ def _json_calls(answer: str) -> Sequence[object] | None:
 
 def last_json_plan(text: str, decoder: json.JSONDecoder) -> object | None:
     """Return the last outermost JSON value that holds a plan. Reads about ``_READ_TIMES`` times the text at most."""
-    plans = (value for _, _, value in _json_values(text, decoder) if _steps_in(value) is not None)
-    return next(iter(deque(plans, maxlen=1)), None)
+    found: object | None = None
+    for _, _, value in _json_values(text, decoder):
+        if _steps_in(value) is not None:
+            found = value
+    return found
 
 
 def _json_values(text: str, decoder: json.JSONDecoder) -> Iterator[tuple[int, int, object]]:

@@ -17,5 +17,10 @@ def training_seed(run_seed: int, task_id: str, epoch: int = 0) -> int:
     return HALF + _half(f"{run_seed}:{task_id}:{epoch}")
 
 
+def split_seed(split: str, run_seed: int, task_id: str) -> int:
+    """Seed of all rollouts of a task of this split, ``train`` or ``heldout``, in a run without epochs."""
+    return training_seed(run_seed, task_id) if split == "train" else evaluation_seed(run_seed, task_id)
+
+
 def _half(text: str) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1

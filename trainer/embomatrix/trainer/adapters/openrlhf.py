@@ -15,7 +15,7 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.skills.seeds import evaluation_seed, training_seed
+from embomatrix.skills.seeds import split_seed
 from embomatrix.trainer.adapters.rows import dataset_named, messages, tasks_of
 from embomatrix.trainer.adapters.scorer import PlanScorer, shared_scorer
 from embomatrix.trainer.config.errors import TrainerError
@@ -24,7 +24,6 @@ from embomatrix.trainer.data.tasks import load_tasks
 
 def rows(dataset: str | Path, split: str = "train", seed: int = 0) -> list[dict[str, Any]]:
     """``{"input": messages, "label": text}`` for each task of a split: ``--data.input_key input --data.label_key label``."""
-    seed_of = training_seed if split == "train" else evaluation_seed
     return [
         {
             "input": messages(task.situation),
@@ -32,7 +31,7 @@ def rows(dataset: str | Path, split: str = "train", seed: int = 0) -> list[dict[
                 task.task.task_id,
                 task.bundle_digest,
                 task.task.profile,
-                seed_of(seed, task.task.task_id),
+                split_seed(split, seed, task.task.task_id),
             ).text(),
         }
         for task in tasks_of(dataset, split)

@@ -20,7 +20,7 @@ from embomatrix.rpc.cluster_address import cluster_named
 from embomatrix.rpc.episodes import TurnFailedError
 from embomatrix.rpc.status import ClusterError
 from embomatrix.skills.prompt import Codec
-from embomatrix.skills.seeds import evaluation_seed, training_seed
+from embomatrix.skills.seeds import split_seed
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.turns import PrefixMismatchError
 from embomatrix.starter.shipped import dataset_named
@@ -116,7 +116,6 @@ class ClusterEpisodes:
 
         TRL adds what the robot knows at the start, which ``reset`` returns, to the empty message of the user.
         """
-        seed_of = training_seed if split == "train" else evaluation_seed
         return [
             {
                 "prompt": [
@@ -124,7 +123,7 @@ class ClusterEpisodes:
                     {"role": "user", "content": ""},
                 ],
                 "task_id": record.task.task_id,
-                "seed": seed_of(self._seed, record.task.task_id),
+                "seed": split_seed(split, self._seed, record.task.task_id),
                 "environment": record.task.profile.value,
             }
             for record in self.environment.dataset.records
